@@ -1,0 +1,1 @@
+"""The mapping core: pure stages and the values between them."""

@@ -1,0 +1,222 @@
+"""Settings of every stage and the presets per kind of sensor; nothing here depends on a particular log.
+
+References:
+    own; the values marked "measured" come from the recorded logs named in the README.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from enum import StrEnum
+from typing import Any
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from hmt_service.errors import InvalidConfig
+
+
+class Section(BaseModel):
+    """Base of all sections: immutable, no unknown keys, field docstrings in the schema."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+
+
+class SensorConfig(Section):
+    """What the range sensor can see."""
+
+    is_planar: bool = True
+    """Whether the robot moves in a plane: poses are then kept planar exactly."""
+    min_range_m: float = Field(default=0.1, ge=0.0)
+    """Returns nearer than this are the robot itself."""
+    max_range_m: float = Field(default=40.0, gt=0.0)
+    """Returns farther than this are no returns."""
+    range_sigma_m: float = Field(default=0.03, gt=0.0)
+    """Standard deviation of one range."""
+
+
+class OdometryConfig(Section):
+    """Metric level: scan registration and keyframe selection."""
+
+    voxel_size_m: float = Field(default=0.1, gt=0.0)
+    """Edge of the cells that the local map is stored in."""
+    points_per_voxel: int = Field(default=20, ge=1)
+    """Most points kept in one cell."""
+    window_keyframes: int = Field(default=30, ge=1)
+    """Number of latest keyframes in the local map."""
+    max_correspondence_m: float = Field(default=0.5, gt=0.0)
+    """Farthest point that a scan point may be matched with."""
+    kernel_m: float = Field(default=0.15, gt=0.0)
+    """Scale of the robust kernel (Geman-McClure)."""
+    keyframe_distance_m: float = Field(default=0.5, gt=0.0)
+    """Motion that makes a keyframe."""
+    keyframe_angle_rad: float = Field(default=0.35, gt=0.0)
+    """Rotation that makes a keyframe."""
+    min_points: int = Field(default=20, ge=3)
+    """A scan with fewer returns is not registered."""
+    min_inlier_share: float = Field(default=0.3, ge=0.0, le=1.0)
+    """A registration that explains less of the scan is refused."""
+    max_correction_m: float = Field(default=1.0, gt=0.0)
+    """A registration that moves the prediction farther is refused."""
+    max_correction_rad: float = Field(default=0.6, gt=0.0)
+    """A registration that turns the prediction farther is refused."""
+    max_gap_s: float = Field(default=5.0, gt=0.0)
+    """Without odometry, a pause longer than this cannot be bridged."""
+
+
+class MotionConfig(Section):
+    """Noise of the motion prior: wheel odometry where there is any, constant velocity elsewhere."""
+
+    sigma_translation_share: float = Field(default=0.1, gt=0.0)
+    """Standard deviation of a translation, m per m travelled."""
+    sigma_rotation_share: float = Field(default=0.1, gt=0.0)
+    """Standard deviation of a rotation, rad per rad turned."""
+    sigma_rotation_rad_per_m: float = Field(default=0.03, gt=0.0)
+    """Standard deviation of the heading, rad per m travelled."""
+    sigma_floor_m: float = Field(default=0.02, gt=0.0)
+    """Least standard deviation of a translation."""
+    sigma_floor_rad: float = Field(default=0.01, gt=0.0)
+    """Least standard deviation of a rotation."""
+
+
+class CovarianceConfig(Section):
+    """From a registration's information to an honest covariance."""
+
+    sigma_m: float = Field(default=0.1, gt=0.0)
+    """Standard deviation of one point-to-plane residual, including the correlation between points."""
+    floor_m: float = Field(default=0.005, gt=0.0)
+    """Least standard deviation of a registered translation."""
+    floor_rad: float = Field(default=0.002, gt=0.0)
+    """Least standard deviation of a registered rotation."""
+
+
+class AreaConfig(Section):
+    """Area abstraction by normalized cut (section IV-A)."""
+
+    cell_size_m: float = Field(default=0.4, gt=0.0)
+    """Edge of the cells whose shared occupancy is the overlap of two keyframes."""
+    max_cut: float = Field(default=0.35, gt=0.0, le=2.0)
+    """Largest normalized cut accepted as a border between areas."""
+    min_keyframes: int = Field(default=4, ge=2)
+    """Fewest keyframes on either side of a border."""
+
+
+class AlignmentConfig(Section):
+    """Search for the relative poses of two submaps, and their refinement."""
+
+    raster_m: float = Field(default=0.2, gt=0.0)
+    """Edge of a cell of the bird's-eye views that are correlated."""
+    angle_step_rad: float = Field(default=0.05, gt=0.0)
+    """Step of the rotations that are tried."""
+    gate_sigma: float = Field(default=3.5, gt=0.0)
+    """Size of the search region in standard deviations of the prior."""
+    max_modes: int = Field(default=4, ge=1)
+    """Most poses kept per pair of submaps."""
+    min_overlap: float = Field(default=0.45, ge=0.0, le=1.0)
+    """Least share of the smaller submap that the other must explain at a pose."""
+    inlier_m: float = Field(default=0.2, gt=0.0)
+    """Distance below which a point counts as explained."""
+
+
+class ObservationConfig(Section):
+    """Likelihood of a scan given a submap, and the background density (section 2.3 of the design)."""
+
+    hit_sigma_m: float = Field(default=0.15, gt=0.0)
+    """Standard deviation of a range around the expected one, submap error included."""
+    angular_resolution_rad: float = Field(default=0.0175, gt=0.0)
+    """Width of one cell of the grid that the submap is projected into."""
+    hit_weight: float = Field(default=0.75, gt=0.0, lt=1.0)
+    """Share of beams that end on what the submap holds; the rest follows the background density."""
+    independent_beams: float = Field(default=6.0, gt=0.0)
+    """How many independent readings the beams of one scan amount to: they are correlated."""
+
+
+class ParticleConfig(Section):
+    """The particle layer (Eq. 6, 12-14)."""
+
+    budget: int = Field(default=15, ge=1)
+    """Most hypotheses kept."""
+    min_ess_share: float = Field(default=0.5, ge=0.0, le=1.0)
+    """Resample when the effective sample size falls below this share of the hypotheses."""
+    negligible_mass: float = Field(default=1e-6, gt=0.0, lt=1.0)
+    """Hypotheses below this posterior mass are dropped."""
+
+
+class Config(Section):
+    """All settings of the mapping core."""
+
+    sensor: SensorConfig = SensorConfig()
+    """What the range sensor can see."""
+    odometry: OdometryConfig = OdometryConfig()
+    """Metric level."""
+    motion: MotionConfig = MotionConfig()
+    """Noise of the motion prior."""
+    covariance: CovarianceConfig = CovarianceConfig()
+    """Covariance of registrations."""
+    areas: AreaConfig = AreaConfig()
+    """Area abstraction."""
+    alignment: AlignmentConfig = AlignmentConfig()
+    """Submap alignment."""
+    observation: ObservationConfig = ObservationConfig()
+    """Observation model."""
+    particles: ParticleConfig = ParticleConfig()
+    """Particle layer."""
+
+    def hash(self) -> str:
+        """Return twelve hexadecimal digits that change when any setting does."""
+        return hashlib.sha256(self.model_dump_json().encode()).hexdigest()[:12]
+
+
+class Preset(StrEnum):
+    """Settings per kind of sensor."""
+
+    PLANAR = "2d"
+    SPATIAL = "3d"
+
+
+_PRESETS: dict[Preset, dict[str, Any]] = {
+    Preset.PLANAR: {},
+    Preset.SPATIAL: {
+        "sensor": {"is_planar": False, "min_range_m": 1.0, "max_range_m": 100.0},
+        "odometry": {
+            "voxel_size_m": 0.75,
+            "max_correspondence_m": 3.0,
+            "kernel_m": 1.0,
+            "keyframe_distance_m": 1.5,
+            "window_keyframes": 15,
+            "max_correction_m": 5.0,
+        },
+        "areas": {"cell_size_m": 1.0},
+        "alignment": {"raster_m": 0.5, "inlier_m": 0.6},
+        "observation": {"hit_sigma_m": 0.4, "angular_resolution_rad": 0.035},
+    },
+}
+
+
+def load_config(preset: Preset = Preset.PLANAR, text: str | None = None) -> Config:
+    """Return a preset, changed by the settings of a YAML document.
+
+    Args:
+        preset: Kind of sensor.
+        text: YAML document with any subset of the sections and keys, or None for the preset alone.
+
+    Raises:
+        InvalidConfig: If the document is no mapping, or a key is unknown or out of range.
+    """
+    try:
+        changes = yaml.safe_load(text) if text else {}
+    except yaml.YAMLError as error:
+        raise InvalidConfig(f"configuration is not YAML: {error}") from error
+    if changes is None:
+        changes = {}
+    if not isinstance(changes, dict):
+        raise InvalidConfig(f"configuration is a {type(changes).__name__}, not a mapping of sections")
+    merged: dict[str, Any] = {name: dict(values) for name, values in _PRESETS[preset].items()}
+    for name, values in changes.items():
+        merged[name] = {**merged.get(name, {}), **values} if isinstance(values, dict) else values
+    try:
+        return Config.model_validate(merged)
+    except ValidationError as error:
+        raise InvalidConfig(f"configuration refused: {error}") from error
+
+

@@ -1,0 +1,1 @@
+"""Files: log readers, the map file, trajectories and ground truth."""

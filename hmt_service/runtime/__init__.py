@@ -1,0 +1,1 @@
+"""Operating-system processes, queues and their life cycle."""

@@ -1,0 +1,1 @@
+"""The Zenoh side: session, keys, codec, query handlers and client."""
