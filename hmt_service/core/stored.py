@@ -1,0 +1,99 @@
+"""Everything that must survive the process: the engine's state as plain values.
+
+Whatever else the engine holds (submaps, graphs, indices) can be computed from these.
+
+References:
+    Blanco et al. 2008, section III (areas, arcs), Eq. (14) (hypotheses and their weights).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from hmt_service.core.geometry import GaussianPose, Pose
+from hmt_service.core.types import Keyframe
+
+
+@dataclass(frozen=True, slots=True)
+class StoredVisit:
+    """Consecutive keyframes that belong to one area; the first of them is the anchor."""
+
+    visit: int
+    """Identifier."""
+    first_keyframe: int
+    """Index of the first keyframe, the anchor."""
+    last_keyframe: int
+    """Index of the last keyframe, included."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StoredAssignment:
+    """Which area a visit went to, in one hypothesis."""
+
+    visit: int
+    """The visit."""
+    area: int
+    """The area."""
+    area_from_visit: GaussianPose | None
+    """Pose of the visit's anchor inside the area; None: the visit founded the area."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StoredFactor:
+    """One independent measurement between the anchors of two visits."""
+
+    visit_a: int
+    """The visit that the measurement starts from."""
+    visit_b: int
+    """The visit that it leads to."""
+    a_from_b: GaussianPose
+    """Measured relative pose of the anchors."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StoredHypothesis:
+    """One topology with its graph."""
+
+    hypothesis: int
+    """Identifier, unique in a run."""
+    log_weight: float
+    """Logarithm of its posterior mass, up to a constant that all hypotheses share."""
+    assignments: tuple[StoredAssignment, ...]
+    """The area of every visit, in the order of the visits: the topological path."""
+    reference_from_visit: Mapping[int, Pose]
+    """Optimised pose of every visit's anchor, shape (4, 4)."""
+    factors: tuple[StoredFactor, ...]
+    """The graph, in the order that its factors were added."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StoredScan:
+    """Where one scan was taken, relative to a keyframe: enough for the whole trajectory."""
+
+    stamp_s: float
+    """Sensor time."""
+    keyframe_index: int
+    """Keyframe that the pose is relative to."""
+    keyframe_from_body: Pose
+    """Pose of the scan relative to that keyframe, shape (4, 4)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StoredMap:
+    """A whole map: enough to answer every question about it, and to go on mapping."""
+
+    revision: int
+    """Map revision: grows with every change."""
+    seed: int
+    """Seed of the random generator of the run."""
+    config_json: str
+    """All settings, as `Config.model_dump_json` writes them."""
+    keyframes: tuple[Keyframe, ...]
+    """In the order of their indices."""
+    visits: tuple[StoredVisit, ...]
+    """In the order that they were made."""
+    hypotheses: tuple[StoredHypothesis, ...]
+    """All hypotheses that are alive, in the engine's order."""
+    scans: tuple[StoredScan, ...]
+    """In the order of their stamps."""
