@@ -19,7 +19,7 @@ try:
 except (ImportError, OSError) as error:
     raise Unavailable(
         f"simulated worlds need Open3D, which does not load: {error} "
-        "(on Debian and Ubuntu its system libraries are in libusb-1.0-0, libgl1, libgomp1)"
+        "(its system libraries on Debian are libusb-1.0-0, libgl1, libgomp1, libx11-6)"
     ) from error
 
 
