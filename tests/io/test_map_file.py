@@ -194,6 +194,16 @@ def test_failed_write_leaves_the_old_map(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [path]
 
 
+def test_old_map_is_replaced_and_never_overwritten(tmp_path: Path) -> None:
+    path = tmp_path / "map.hmt"
+    write_map(path, random_map(2))
+    before = path.read_bytes()
+    with path.open("rb") as held_open:
+        write_map(path, random_map(3))
+        assert held_open.read() == before
+    assert path.read_bytes() != before
+
+
 def test_left_over_of_a_killed_writer_is_replaced(tmp_path: Path) -> None:
     (tmp_path / "map.hmt.partial").write_bytes(b"half a map")
     write_map(tmp_path / "map.hmt", random_map(2))
