@@ -1,0 +1,1 @@
+"""Benchmarks: measured numbers of the whole chain, each with a unit and a direction."""
