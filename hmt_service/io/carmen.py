@@ -1,0 +1,297 @@
+"""Reader for CARMEN logs: planar laser scans and wheel odometry, one message per line.
+
+    FLASER n r1..rn LASER ROBOT TIME
+    ROBOTLASER1 CONFIG n r1..rn m e1..em LASER ROBOT tv rv forward side turn TIME
+    RAWLASER1 CONFIG n r1..rn m e1..em TIME
+    ODOM ROBOT tv rv acceleration TIME
+
+LASER and ROBOT are poses `x y theta` in the odometry's frame, CONFIG is `type start_angle
+field_of_view resolution max_range accuracy remission_mode`, e are remissions and TIME is `ipc_time
+host logger_time`. The stamp is the ipc time. Raw scans count only in a log without other scans;
+other messages are left out.
+
+References:
+    Montemerlo, Roy and Thrun, CARMEN robot navigation toolkit (log format of `logger`).
+"""
+
+from __future__ import annotations
+
+import bz2
+import gzip
+import math
+import zlib
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import pairwise
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from hmt_service.core.geometry import (
+    FloatArray,
+    Pose,
+    identity,
+    inverse,
+    planar_pose,
+    transform_points,
+)
+from hmt_service.core.types import OdometryReading, Reading, Scan
+from hmt_service.errors import InvalidLog
+
+_WORDS_IN_CONFIG = 7
+_WORDS_IN_TIME = 3
+_WORDS_BETWEEN_POSES_AND_TIME = 5
+_GZIP_MAGIC = b"\x1f\x8b"
+_BZIP2_MAGIC = b"BZh"
+
+
+@dataclass(frozen=True, slots=True)
+class MalformedLine:
+    """A line that should hold a reading and does not."""
+
+    line: int
+    """Number of the line, from 1."""
+    reason: str
+    """What is wrong with it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CarmenLog:
+    """What a CARMEN log holds."""
+
+    readings: tuple[Reading, ...]
+    """In the order of time; at equal stamps odometry comes before the scan."""
+    scans: int
+    """Number of scans among them."""
+    odometry: int
+    """Number of odometry readings among them, those that come with a scan included."""
+    out_of_order: int
+    """Number of scans that are older than the scan before them in the file."""
+    malformed: tuple[MalformedLine, ...]
+    """Lines that were left out, in the order of the file."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Limits:
+    """Which ranges are returns."""
+
+    min_range_m: float
+    max_range_m: float
+
+
+class _Malformed(Exception):
+    """Reason why one line cannot be used."""
+
+
+def read_carmen(path: Path, *, min_range_m: float, max_range_m: float) -> CarmenLog:
+    """Read a CARMEN log: plain, gzip or bzip2, whatever its name.
+
+    A line that cannot be used, or a compressed file that ends too early, costs the readings on
+    it, never those around it.
+
+    Args:
+        path: The log.
+        min_range_m: Returns nearer than this are left out of the scans.
+        max_range_m: Returns farther than this are left out of the scans.
+
+    Raises:
+        InvalidLog: If the file cannot be opened or holds no usable scan.
+    """
+    limits = _Limits(min_range_m, max_range_m)
+    readings: list[Reading] = []
+    raw_scans: list[Reading] = []
+    malformed: list[MalformedLine] = []
+    number = 0
+    try:
+        with _open(path) as file:
+            for number, line in enumerate(_whole_lines(file), 1):
+                try:
+                    target = raw_scans if line.startswith(b"RAWLASER1") else readings
+                    target += _parse(line, limits)
+                except _Malformed as reason:
+                    malformed.append(MalformedLine(number, str(reason)))
+    except _Malformed as reason:
+        malformed.append(MalformedLine(number + 1, str(reason)))
+    except OSError as error:
+        raise InvalidLog(f"cannot read {path}: {error.strerror}") from error
+
+    # CARMEN's logger can write every scan twice, raw and with the robot's pose.
+    if not any(isinstance(reading, Scan) for reading in readings):
+        readings += raw_scans
+    scan_stamps_s = [reading.stamp_s for reading in readings if isinstance(reading, Scan)]
+    if not scan_stamps_s:
+        first = f", the first: {malformed[0].reason}" if malformed else ""
+        raise InvalidLog(
+            f"{path}: no CARMEN scan in {number} lines ({len(malformed)} malformed{first})"
+        )
+    return CarmenLog(
+        readings=tuple(sorted(readings, key=lambda r: (r.stamp_s, isinstance(r, Scan)))),
+        scans=len(scan_stamps_s),
+        odometry=len(readings) - len(scan_stamps_s),
+        out_of_order=sum(later < earlier for earlier, later in pairwise(scan_stamps_s)),
+        malformed=tuple(malformed),
+    )
+
+
+def _open(path: Path) -> BinaryIO | gzip.GzipFile | bz2.BZ2File:
+    with path.open("rb") as file:
+        magic = file.read(max(len(_GZIP_MAGIC), len(_BZIP2_MAGIC)))
+    if magic.startswith(_GZIP_MAGIC):
+        return gzip.open(path)
+    if magic.startswith(_BZIP2_MAGIC):
+        return bz2.open(path)
+    return path.open("rb")
+
+
+def _whole_lines(file: Iterable[bytes]) -> Iterator[bytes]:
+    """Yield the lines up to where the compressed stream breaks, then raise `_Malformed`."""
+    try:
+        yield from file
+    except (EOFError, OSError, zlib.error) as error:
+        raise _Malformed(f"compressed stream is damaged: {error}") from error
+
+
+def _parse(line: bytes, limits: _Limits) -> tuple[Reading, ...]:
+    """Return the readings on one line, none if it holds another message.
+
+    Raises:
+        _Malformed: If it should hold a reading and does not.
+    """
+    tag, *words = line.split() or [b""]
+    parser = _PARSERS.get(tag)
+    return parser(_Words(words), limits) if parser else ()
+
+
+class _Words:
+    """The words of one line, taken from left to right."""
+
+    def __init__(self, words: list[bytes]) -> None:
+        self._words = words
+        self._taken = 0
+
+    def numbers(self, count: int) -> FloatArray:
+        words = self._words[self._taken : self._taken + count]
+        if len(words) < count:
+            raise _Malformed(f"{len(words)} words left where {count} numbers should be")
+        self._taken += count
+        try:
+            return np.array(words, dtype=np.float64)
+        except ValueError as error:
+            raise _Malformed(str(error)) from error
+
+    def finite(self, count: int) -> FloatArray:
+        numbers = self.numbers(count)
+        if not np.isfinite(numbers).all():
+            raise _Malformed(f"not finite: {numbers}")
+        return numbers
+
+    def counted(self) -> FloatArray:
+        """Take a count and as many numbers."""
+        count = float(self.finite(1)[0])
+        if count < 0 or not count.is_integer():
+            raise _Malformed(f"{count} is no count")
+        return self.numbers(int(count))
+
+    def ranges(self) -> FloatArray:
+        """Take a count and as many ranges; an infinite one is a beam without return."""
+        ranges = self.counted()
+        if ranges.size < 2:
+            raise _Malformed(f"{ranges.size} beams")
+        if not (ranges >= 0.0).all():
+            raise _Malformed(f"{int((~(ranges >= 0.0)).sum())} ranges negative or not a number")
+        return ranges
+
+    def pose(self) -> Pose:
+        x_m, y_m, yaw_rad = self.finite(3).tolist()
+        return planar_pose(x_m, y_m, yaw_rad)
+
+    def stamp_s(self) -> float:
+        """Take the ipc time, which must be followed by exactly the host and the logger's time."""
+        left = len(self._words) - self._taken
+        if left != _WORDS_IN_TIME:
+            raise _Malformed(f"{left} words left where time, host and time should be")
+        return float(self.finite(1)[0])
+
+
+def _odom(words: _Words, _: _Limits) -> tuple[Reading, ...]:
+    odom_from_body = words.pose()
+    words.finite(3)
+    return (OdometryReading(words.stamp_s(), odom_from_body),)
+
+
+def _flaser(words: _Words, limits: _Limits) -> tuple[Reading, ...]:
+    ranges_m = words.ranges()
+    odom_from_laser, odom_from_body = words.pose(), words.pose()
+    stamp_s = words.stamp_s()
+    body_from_laser = inverse(odom_from_body) @ odom_from_laser
+    # 180 beams are those of a scanner with 181, without the last one.
+    step_rad = math.pi / (180 if ranges_m.size == 180 else ranges_m.size - 1)
+    directions = _directions(ranges_m.size, -math.pi / 2, step_rad)
+    return (
+        OdometryReading(stamp_s, odom_from_body),
+        _scan(stamp_s, ranges_m, directions, body_from_laser, limits),
+    )
+
+
+def _robotlaser1(words: _Words, limits: _Limits) -> tuple[Reading, ...]:
+    ranges_m, directions = _configured_sweep(words)
+    odom_from_laser, odom_from_body = words.pose(), words.pose()
+    words.finite(_WORDS_BETWEEN_POSES_AND_TIME)
+    stamp_s = words.stamp_s()
+    body_from_laser = inverse(odom_from_body) @ odom_from_laser
+    return (
+        OdometryReading(stamp_s, odom_from_body),
+        _scan(stamp_s, ranges_m, directions, body_from_laser, limits),
+    )
+
+
+def _rawlaser1(words: _Words, limits: _Limits) -> tuple[Reading, ...]:
+    ranges_m, directions = _configured_sweep(words)
+    return (_scan(words.stamp_s(), ranges_m, directions, identity(), limits),)
+
+
+_PARSERS: dict[bytes, Callable[[_Words, _Limits], tuple[Reading, ...]]] = {
+    b"ODOM": _odom,
+    b"FLASER": _flaser,
+    b"ROBOTLASER1": _robotlaser1,
+    b"RAWLASER1": _rawlaser1,
+}
+
+
+def _configured_sweep(words: _Words) -> tuple[FloatArray, FloatArray]:
+    """Take CONFIG, ranges and remissions; return ranges (inf: no return) and directions."""
+    _, start_rad, _, step_rad, sensor_max_m, _, _ = words.finite(_WORDS_IN_CONFIG).tolist()
+    if step_rad <= 0.0:
+        raise _Malformed(f"beams {step_rad} rad apart")
+    ranges_m = words.ranges()
+    words.counted()
+    if sensor_max_m > 0.0:
+        ranges_m[ranges_m >= sensor_max_m] = math.inf
+    return ranges_m, _directions(ranges_m.size, start_rad, step_rad)
+
+
+@lru_cache(maxsize=16)
+def _directions(beams: int, start_rad: float, step_rad: float) -> FloatArray:
+    """Return the unit vectors of the beams in the laser's frame, shape (beams, 3), read-only."""
+    bearings_rad = start_rad + step_rad * np.arange(beams)
+    directions = np.column_stack([np.cos(bearings_rad), np.sin(bearings_rad), np.zeros(beams)])
+    directions.flags.writeable = False
+    return directions
+
+
+def _scan(
+    stamp_s: float,
+    ranges_m: FloatArray,
+    directions: FloatArray,
+    body_from_laser: Pose,
+    limits: _Limits,
+) -> Scan:
+    is_return = (ranges_m >= limits.min_range_m) & (ranges_m <= limits.max_range_m)
+    points_in_laser = ranges_m[is_return, np.newaxis] * directions[is_return]
+    return Scan(
+        stamp_s=stamp_s,
+        points_in_body=transform_points(body_from_laser, points_in_laser),
+        sensor_in_body=body_from_laser[:3, 3].copy(),
+    )
