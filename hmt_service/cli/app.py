@@ -1,0 +1,42 @@
+"""The `hmt` command: every module beside this one is one command, added to the list at the end.
+
+References: own.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from hmt_service import __version__
+from hmt_service.cli import evaluate
+
+app = typer.Typer(
+    name="hmt",
+    help="Hybrid metric-topological SLAM.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+
+def _print_version(is_wanted: bool) -> None:
+    if is_wanted:
+        typer.echo(f"hmt {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    _: Annotated[
+        bool,
+        typer.Option(
+            "--version", callback=_print_version, is_eager=True, help="Show the version and exit."
+        ),
+    ] = False,
+) -> None:
+    """Hybrid metric-topological SLAM."""
+
+
+app.command("eval")(evaluate.evaluate)
