@@ -6,6 +6,7 @@
     |   +-- InvalidLog    a log file from which nothing can be read
     +-- NotFound          an area, hypothesis or file that does not exist
     +-- Unavailable       the answer does not exist yet, or nobody is there to give it
+    |   +-- DeadlineExceeded the answer takes longer than anybody waits for it
     +-- DaemonFailure     a process of the daemon died or did not start
 
 References: own.
@@ -45,6 +46,12 @@ class Unavailable(HmtError):
     """The answer does not exist yet, or nobody is there to give it."""
 
     code = "UNAVAILABLE"
+
+
+class DeadlineExceeded(Unavailable):
+    """The answer takes longer than anybody waits for it."""
+
+    code = "DEADLINE_EXCEEDED"
 
 
 class DaemonFailure(HmtError):

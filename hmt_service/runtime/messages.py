@@ -1,0 +1,193 @@
+"""What the processes of the daemon say to each other: frozen values, pickled over pipes.
+
+Every message that the parent sends is answered by exactly one message of the child on the same
+pipe, in order. That makes the number of messages under way known, and a bound on it a bound on
+memory.
+
+References:
+    own.
+"""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import StrEnum
+from multiprocessing.reduction import ForkingPickler
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
+
+from hmt_service.core.types import (
+    Comparison,
+    Event,
+    GlobalMap,
+    MapMethod,
+    Snapshot,
+    Tracking,
+)
+from hmt_service.errors import HmtError
+
+if TYPE_CHECKING:
+    from hmt_service.core.engine import Engine
+
+
+class ProcessName(StrEnum):
+    """The processes of the daemon."""
+
+    GATEWAY = "gateway"
+    ODOMETRY = "odometry"
+    TOPOLOGY = "topology"
+
+
+@dataclass(frozen=True, slots=True)
+class Ready:
+    """A child has loaded its libraries; the only message that is no answer."""
+
+
+@dataclass(frozen=True, slots=True)
+class Stop:
+    """End; the only message without an answer."""
+
+
+@dataclass(frozen=True, slots=True)
+class Finish:
+    """No reading will follow; travels behind the last one through every process."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tracked:
+    """The odometry has processed one reading."""
+
+    tracking: Tracking | None
+    """What it says of the scan; None for odometry readings."""
+    processed: int
+    """Readings processed so far."""
+    busy_s: float
+    """Time spent on them, s of the wall clock."""
+
+
+@dataclass(frozen=True, slots=True)
+class RunReport:
+    """What the run has cost so far."""
+
+    scans: int
+    """Scans in the map."""
+    odometry_busy_s: float
+    """Time that the odometry has worked, s of the wall clock."""
+    topology_busy_s: float
+    """Time that the topology has worked, s of the wall clock."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mapped:
+    """The topology has processed one scan, or the end of the data."""
+
+    snapshot: Snapshot | None
+    """What readers may know now; None when nothing changed."""
+    events: tuple[Event, ...]
+    """What happened to the map."""
+    report: RunReport
+    """What the run has cost so far."""
+    finished: Finished | None = None
+    """Set in the answer to `Finish`."""
+
+
+@dataclass(frozen=True, slots=True)
+class Finished:
+    """The last area is closed and the map is saved."""
+
+    files: tuple[str, ...]
+    """Names of the files written."""
+    failure: str | None = None
+    """Why they could not be written, if so."""
+
+
+@dataclass(frozen=True, slots=True)
+class MapRequest:
+    """Compose a global map."""
+
+    method: MapMethod
+    """How."""
+    reference_area: int | None = None
+    """Area whose frame it shall be in; None for the engine's choice."""
+    hypothesis: int | None = None
+    """Hypothesis; None for the most probable one."""
+    with_points: bool = True
+    """Whether to include the submaps."""
+
+
+@dataclass(frozen=True, slots=True)
+class CompareRequest:
+    """Compare both global maps."""
+
+    reference_area: int | None = None
+    """Area whose frame both shall be in; None for the engine's choice."""
+    hypothesis: int | None = None
+    """Hypothesis; None for the most probable one."""
+
+
+@dataclass(frozen=True, slots=True)
+class SaveRequest:
+    """Save the map as it is now."""
+
+
+@dataclass(frozen=True, slots=True)
+class ProcessStatus:
+    """What one child is doing."""
+
+    name: ProcessName
+    """Which one."""
+    pid: int
+    """Its number in the operating system."""
+    is_ready: bool
+    """Whether it has loaded its libraries."""
+    backlog: int
+    """Messages handed to it and not yet answered."""
+    processed: int
+    """Readings (odometry) or scans (topology) processed."""
+    busy_s: float
+    """Time spent on them, s of the wall clock."""
+
+
+@dataclass(frozen=True, slots=True)
+class ProcessFailure:
+    """A child ended although nobody asked it to."""
+
+    name: ProcessName
+    """Which one."""
+    pid: int
+    """Its number in the operating system."""
+    reason: str
+    """How it ended."""
+
+    def __str__(self) -> str:
+        """Return one sentence for a person."""
+        return f"process {self.name} (pid {self.pid}) {self.reason}"
+
+
+Request = MapRequest | CompareRequest | SaveRequest
+"""What the topology process can be asked."""
+Result = GlobalMap | Comparison | tuple[str, ...] | HmtError
+"""Its answers: a map, a comparison, the names of saved files, or why not."""
+
+Save = Callable[["Engine", RunReport], tuple[str, ...]]
+"""Writes the results and returns the files' names; picklable, for the topology process runs it."""
+
+
+def _rebuild_mapping(items: dict[Any, Any]) -> MappingProxyType[Any, Any]:
+    return MappingProxyType(items)
+
+
+# Events hold read-only views of dictionaries, which pickle refuses.
+ForkingPickler.register(MappingProxyType, lambda mapping: (_rebuild_mapping, (dict(mapping),)))
+
+
+def dump(message: object) -> bytes:
+    """Return a message as bytes."""
+    return bytes(ForkingPickler.dumps(message))
+
+
+def load(data: bytes) -> Any:
+    """Return the message in bytes that `dump` made: trusted, both ends are this program."""
+    return pickle.loads(data)

@@ -1,0 +1,440 @@
+"""Our own messages: values of the core and of the service to `hmt.v1` protobuf and back.
+
+References:
+    proto/hmt_service/service/v1/hmt.proto.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any, TypeVar
+
+import numpy as np
+from google.protobuf.message import DecodeError, Message
+
+from hmt_service.core.geometry import GaussianPose, pose_of, quaternion_of
+from hmt_service.core.types import (
+    Arc,
+    ArcResidual,
+    AreaDifference,
+    Comparison,
+    Event,
+    EventKind,
+    GlobalMap,
+    HmtPose,
+    HypothesisSummary,
+    MapMethod,
+    PlacedArea,
+    Posterior,
+)
+from hmt_service.errors import (
+    DaemonFailure,
+    DeadlineExceeded,
+    HmtError,
+    InvalidInput,
+    NotFound,
+    Unavailable,
+)
+from hmt_service.runtime.messages import ProcessName, ProcessStatus
+from hmt_service.service.reports import Ack, DaemonState, InputCounts, Status
+from hmt_service.service.v1 import hmt_pb2 as pb
+
+_PREFIX = "application/protobuf;"
+_FAILURES: dict[str, type[HmtError]] = {
+    error.code: error
+    for error in (InvalidInput, NotFound, Unavailable, DeadlineExceeded, DaemonFailure)
+}
+
+E_ = TypeVar("E_", bound=StrEnum)
+
+
+@dataclass(frozen=True, slots=True)
+class Wire:
+    """One payload as it travels."""
+
+    payload: bytes
+    """A serialised protobuf."""
+    encoding: str
+    """`application/protobuf;` and the full name of its message."""
+
+
+def wire(message: Message) -> Wire:
+    """Return a protobuf ready to travel."""
+    return Wire(message.SerializeToString(), encoding_of(type(message)))
+
+
+def encoding_of(message: type[Message]) -> str:
+    """Return the encoding that payloads of this message travel with."""
+    return _PREFIX + message.DESCRIPTOR.full_name
+
+
+Value = HmtPose | Posterior | GlobalMap | Comparison | Event | tuple[Event, ...] | Status | Ack
+"""What the daemon publishes and answers."""
+
+
+def encode(value: Value | HmtError) -> Wire:
+    """Return the payload of a publication, an answer or an error reply."""
+    return wire(_message_of(value))
+
+
+def decode(payload: bytes, encoding: str) -> Value | HmtError:
+    """Return the value of a payload of the daemon.
+
+    Raises:
+        InvalidInput: If the encoding is not one of ours, or the payload does not hold what it says.
+    """
+    if encoding not in _DECODERS:
+        raise InvalidInput(f"unknown encoding {encoding!r}, {len(payload)} bytes")
+    message_type, from_proto = _DECODERS[encoding]
+    try:
+        return from_proto(message_type.FromString(payload))
+    except (DecodeError, ValueError) as error:
+        raise InvalidInput(f"{len(payload)} bytes are no {encoding}: {error}") from error
+
+
+def _message_of(value: Value | HmtError) -> Message:
+    match value:
+        case HmtPose():
+            return _pose_to_proto(value)
+        case Posterior():
+            return _posterior_to_proto(value)
+        case GlobalMap():
+            return _map_to_proto(value)
+        case Comparison():
+            return _comparison_to_proto(value)
+        case Event():
+            return _event_to_proto(value)
+        case tuple():
+            return pb.Events(events=map(_event_to_proto, value))
+        case Status():
+            return _status_to_proto(value)
+        case Ack():
+            return pb.Ack(
+                received=value.received,
+                accepted=value.accepted,
+                refused=value.refused,
+                processed_scans=value.processed_scans,
+                files=value.files,
+            )
+        case HmtError():
+            return pb.Error(code=f"ERROR_CODE_{value.code}", message=str(value))
+
+
+def _gaussian_to_proto(pose: GaussianPose) -> pb.GaussianPose:
+    x, y, z = pose.mean[:3, 3].tolist()
+    qx, qy, qz, qw = quaternion_of(pose.mean).tolist()
+    covariance = pose.covariance.ravel().tolist()
+    return pb.GaussianPose(x_m=x, y_m=y, z_m=z, qx=qx, qy=qy, qz=qz, qw=qw, covariance=covariance)
+
+
+def _gaussian(message: pb.GaussianPose) -> GaussianPose:
+    quaternion = np.array([message.qx, message.qy, message.qz, message.qw])
+    mean = pose_of(quaternion, np.array([message.x_m, message.y_m, message.z_m]))
+    return GaussianPose(mean, np.array(message.covariance, dtype=np.float64).reshape(6, 6))
+
+
+def _pose_to_proto(pose: HmtPose) -> pb.HmtPose:
+    return pb.HmtPose(
+        stamp_s=pose.stamp_s,
+        area=pose.area,
+        area_from_body=_gaussian_to_proto(pose.area_from_body),
+        reference_area=pose.reference_area,
+        reference_from_body=_gaussian_to_proto(pose.reference_from_body),
+        hypothesis=pose.hypothesis,
+        probability=pose.probability,
+        revision=pose.revision,
+    )
+
+
+def _pose(message: pb.HmtPose) -> HmtPose:
+    return HmtPose(
+        stamp_s=message.stamp_s,
+        area=message.area,
+        area_from_body=_gaussian(message.area_from_body),
+        reference_area=message.reference_area,
+        reference_from_body=_gaussian(message.reference_from_body),
+        hypothesis=message.hypothesis,
+        probability=message.probability,
+        revision=message.revision,
+    )
+
+
+def _posterior_to_proto(posterior: Posterior) -> pb.Posterior:
+    return pb.Posterior(
+        stamp_s=posterior.stamp_s,
+        revision=posterior.revision,
+        hypotheses=[
+            pb.HypothesisSummary(
+                hypothesis=summary.hypothesis,
+                probability=summary.probability,
+                current_area=summary.current_area,
+                topological_path=summary.topological_path,
+                areas=summary.areas,
+                loop_closures=summary.loop_closures,
+            )
+            for summary in posterior.hypotheses
+        ],
+        current_area=dict(posterior.current_area),
+        effective_sample_size=posterior.effective_sample_size,
+    )
+
+
+def _posterior(message: pb.Posterior) -> Posterior:
+    return Posterior(
+        stamp_s=message.stamp_s,
+        revision=message.revision,
+        hypotheses=tuple(
+            HypothesisSummary(
+                hypothesis=summary.hypothesis,
+                probability=summary.probability,
+                current_area=summary.current_area,
+                topological_path=tuple(summary.topological_path),
+                areas=summary.areas,
+                loop_closures=summary.loop_closures,
+            )
+            for summary in message.hypotheses
+        ),
+        current_area=dict(message.current_area),
+        effective_sample_size=message.effective_sample_size,
+    )
+
+
+def _map_to_proto(global_map: GlobalMap) -> pb.GlobalMap:
+    return pb.GlobalMap(
+        method=f"MAP_METHOD_{global_map.method.name}",
+        reference_area=global_map.reference_area,
+        hypothesis=global_map.hypothesis,
+        probability=global_map.probability,
+        revision=global_map.revision,
+        areas=[
+            pb.PlacedArea(
+                area=area.area,
+                reference_from_area=_gaussian_to_proto(area.reference_from_area),
+                keyframes=area.keyframes,
+                visits=area.visits,
+                points_in_area=np.asarray(area.points_in_area, dtype="<f4").tobytes(),
+            )
+            for area in global_map.areas
+        ],
+        arcs=[
+            pb.Arc(
+                area_a=arc.area_a,
+                area_b=arc.area_b,
+                a_from_b=_gaussian_to_proto(arc.a_from_b),
+                traversals=arc.traversals,
+            )
+            for arc in global_map.arcs
+        ],
+    )
+
+
+def _map(message: pb.GlobalMap) -> GlobalMap:
+    return GlobalMap(
+        method=_enum(MapMethod, pb.MapMethod.Name(message.method), "MAP_METHOD_"),
+        reference_area=message.reference_area,
+        hypothesis=message.hypothesis,
+        probability=message.probability,
+        revision=message.revision,
+        areas=tuple(
+            PlacedArea(
+                area=area.area,
+                reference_from_area=_gaussian(area.reference_from_area),
+                keyframes=area.keyframes,
+                visits=area.visits,
+                points_in_area=np.frombuffer(area.points_in_area, dtype="<f4").reshape(-1, 3),
+            )
+            for area in message.areas
+        ),
+        arcs=tuple(
+            Arc(arc.area_a, arc.area_b, _gaussian(arc.a_from_b), arc.traversals)
+            for arc in message.arcs
+        ),
+    )
+
+
+def _comparison_to_proto(comparison: Comparison) -> pb.Comparison:
+    return pb.Comparison(
+        reference_area=comparison.reference_area,
+        hypothesis=comparison.hypothesis,
+        revision=comparison.revision,
+        areas=[
+            pb.AreaDifference(
+                area=area.area,
+                translation_m=area.translation_m,
+                rotation_rad=area.rotation_rad,
+                sigma_consistent_m=area.sigma_consistent_m,
+                sigma_shortest_path_m=area.sigma_shortest_path_m,
+            )
+            for area in comparison.areas
+        ],
+        arcs=[
+            pb.ArcResidual(
+                area_a=arc.area_a,
+                area_b=arc.area_b,
+                consistent_m=arc.consistent_m,
+                shortest_path_m=arc.shortest_path_m,
+            )
+            for arc in comparison.arcs
+        ],
+    )
+
+
+def _comparison(message: pb.Comparison) -> Comparison:
+    return Comparison(
+        reference_area=message.reference_area,
+        hypothesis=message.hypothesis,
+        revision=message.revision,
+        areas=tuple(
+            AreaDifference(
+                area=area.area,
+                translation_m=area.translation_m,
+                rotation_rad=area.rotation_rad,
+                sigma_consistent_m=area.sigma_consistent_m,
+                sigma_shortest_path_m=area.sigma_shortest_path_m,
+            )
+            for area in message.areas
+        ),
+        arcs=tuple(
+            ArcResidual(
+                area_a=arc.area_a,
+                area_b=arc.area_b,
+                consistent_m=arc.consistent_m,
+                shortest_path_m=arc.shortest_path_m,
+            )
+            for arc in message.arcs
+        ),
+    )
+
+
+def _event_to_proto(event: Event) -> pb.Event:
+    return pb.Event(
+        kind=f"EVENT_KIND_{event.kind.name}",
+        stamp_s=event.stamp_s,
+        message=event.message,
+        numbers=dict(event.numbers),
+    )
+
+
+def _event(message: pb.Event) -> Event:
+    return Event(
+        kind=_enum(EventKind, pb.EventKind.Name(message.kind), "EVENT_KIND_"),
+        stamp_s=message.stamp_s,
+        message=message.message,
+        numbers=dict(message.numbers),
+    )
+
+
+def _status_to_proto(status: Status) -> pb.Status:
+    counts = status.input
+    return pb.Status(
+        version=status.version,
+        config_hash=status.config_hash,
+        state=f"DAEMON_STATE_{status.state.name}",
+        uptime_s=status.uptime_s,
+        input=pb.InputCounts(
+            received=counts.received,
+            accepted=counts.accepted,
+            refused=dict(counts.refused),
+            queued=counts.queued,
+            queued_bytes=counts.queued_bytes,
+            discarded=counts.discarded,
+            reordering=counts.reordering,
+            dropped_beams=dict(counts.dropped_beams),
+        ),
+        tracked_scans=status.tracked_scans,
+        processed_scans=status.processed_scans,
+        processes=[
+            pb.ProcessStatus(
+                name=process.name,
+                pid=process.pid,
+                is_ready=process.is_ready,
+                backlog=process.backlog,
+                processed=process.processed,
+                busy_s=process.busy_s,
+            )
+            for process in status.processes
+        ],
+        revision=status.revision,
+        areas=status.areas,
+        arcs=status.arcs,
+        keyframes=status.keyframes,
+        hypotheses=status.hypotheses,
+    )
+
+
+def _status(message: pb.Status) -> Status:
+    counts = message.input
+    return Status(
+        version=message.version,
+        config_hash=message.config_hash,
+        state=_enum(DaemonState, pb.DaemonState.Name(message.state), "DAEMON_STATE_"),
+        uptime_s=message.uptime_s,
+        input=InputCounts(
+            received=counts.received,
+            accepted=counts.accepted,
+            refused=dict(counts.refused),
+            queued=counts.queued,
+            queued_bytes=counts.queued_bytes,
+            discarded=counts.discarded,
+            reordering=counts.reordering,
+            dropped_beams=dict(counts.dropped_beams),
+        ),
+        tracked_scans=message.tracked_scans,
+        processed_scans=message.processed_scans,
+        processes=tuple(
+            ProcessStatus(
+                name=ProcessName(process.name),
+                pid=process.pid,
+                is_ready=process.is_ready,
+                backlog=process.backlog,
+                processed=process.processed,
+                busy_s=process.busy_s,
+            )
+            for process in message.processes
+        ),
+        revision=message.revision,
+        areas=message.areas,
+        arcs=message.arcs,
+        keyframes=message.keyframes,
+        hypotheses=message.hypotheses,
+    )
+
+
+def _ack(message: pb.Ack) -> Ack:
+    return Ack(
+        received=message.received,
+        accepted=message.accepted,
+        refused=message.refused,
+        processed_scans=message.processed_scans,
+        files=tuple(message.files),
+    )
+
+
+def _error(message: pb.Error) -> HmtError:
+    code = pb.ErrorCode.Name(message.code).removeprefix("ERROR_CODE_")
+    return _FAILURES.get(code, DaemonFailure)(message.message)
+
+
+def _enum(enum: type[E_], name: str, prefix: str) -> E_:
+    try:
+        return enum[name.removeprefix(prefix)]
+    except KeyError as error:
+        raise InvalidInput(f"{name} is not known here: the daemon is of another version") from error
+
+
+_DECODERS: dict[str, tuple[type[Message], Callable[[Any], Value | HmtError]]] = {
+    encoding_of(message): (message, from_proto)
+    for message, from_proto in (
+        (pb.HmtPose, _pose),
+        (pb.Posterior, _posterior),
+        (pb.GlobalMap, _map),
+        (pb.Comparison, _comparison),
+        (pb.Event, _event),
+        (pb.Events, lambda message: tuple(map(_event, message.events))),
+        (pb.Status, _status),
+        (pb.Ack, _ack),
+        (pb.Error, _error),
+    )
+}

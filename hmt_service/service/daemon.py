@@ -1,0 +1,168 @@
+"""The life of the daemon: start, serve, and stop in time whatever happens.
+
+References:
+    own.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, wait
+from dataclasses import dataclass, field
+
+import zenoh
+
+from hmt_service.core.config import Config
+from hmt_service.core.types import Event, EventKind
+from hmt_service.errors import DaemonFailure
+from hmt_service.runtime.messages import Finished, ProcessFailure, ProcessName, Save
+from hmt_service.runtime.pipeline import Pipeline
+from hmt_service.service.gateway import Gateway
+from hmt_service.service.intake import IntakeLimits
+from hmt_service.service.keys import Keys
+from hmt_service.service.reports import Status
+from hmt_service.service.session import Endpoints, open_session
+
+_TICK_S = 0.1
+_POLL_S = 0.02
+_DRAIN_S = 3.0
+"""Time for the input that waits when the daemon is told to stop."""
+_SAVE_S = 4.5
+"""Time, from the same moment, after which the map is given up."""
+_STOP_S = 4.8
+"""Time, from the same moment, after which processes are killed."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DaemonSettings:
+    """What a daemon is started with."""
+
+    keys: Keys
+    """Under which names it serves."""
+    endpoints: Endpoints
+    """Where it meets others."""
+    config: Config
+    """Settings of the mapping core."""
+    seed: int = 0
+    """Seed of the engine's random generator."""
+    save: Save | None = None
+    """Writes the results, in the topology process; None for never."""
+    limits: IntakeLimits = field(default_factory=IntakeLimits)
+    """What may wait at the input."""
+
+
+@dataclass(frozen=True, slots=True)
+class StopReport:
+    """How the daemon ended."""
+
+    reason: str
+    """Who or what stopped it."""
+    failure: ProcessFailure | None
+    """The process that died, if one did."""
+    status: Status
+    """Its last words."""
+    finished: Finished | None
+    """What was saved; None when there was no time for it, or nobody to do it."""
+    killed: tuple[ProcessName, ...]
+    """Processes that did not end in time."""
+
+    @property
+    def unprocessed(self) -> int:
+        """Samples that were neither refused nor came into the map."""
+        counts, status = self.status.input, self.status
+        processed = {process.name: process.processed for process in status.processes}
+        readings = counts.received - sum(counts.refused.values())
+        scans = status.tracked_scans - status.processed_scans
+        return readings - processed[ProcessName.ODOMETRY] + scans
+
+
+class Daemon:
+    """Owner of the session, the gateway and the pipeline."""
+
+    def __init__(self, settings: DaemonSettings) -> None:
+        self._settings = settings
+        self._reason: str | None = None
+
+    def request_stop(self, reason: str) -> None:
+        """Make `run` return soon; may be called from a signal handler or any thread."""
+        self._reason = self._reason or reason
+
+    def run(self, *, on_open: Callable[[], None] = lambda: None) -> StopReport:
+        """Serve until asked to stop, or until a process dies.
+
+        Args:
+            on_open: Called when input is taken.
+
+        Raises:
+            Unavailable: If the endpoints cannot be used.
+            DaemonFailure: If another daemon serves the same robot.
+        """
+        settings = self._settings
+        with open_session(settings.endpoints) as session:
+            _refuse_second(session, settings.keys)
+            pipeline = Pipeline(settings.config, seed=settings.seed, save=settings.save)
+            gateway = Gateway(
+                session,
+                settings.keys,
+                settings.config,
+                pipeline,
+                limits=settings.limits,
+                shut_down=lambda: self.request_stop("a client"),
+            )
+            pipeline.start(gateway)
+            try:
+                gateway.open()
+                on_open()
+                failure = self._serve(gateway, pipeline)
+                return self._stop(gateway, pipeline, failure)
+            finally:
+                pipeline.stop(0.0)
+
+    def _serve(self, gateway: Gateway, pipeline: Pipeline) -> ProcessFailure | None:
+        while self._reason is None:
+            failure = pipeline.failure(_TICK_S) or gateway.failure()
+            if failure is not None:
+                return failure
+            gateway.tick()
+        return None
+
+    def _stop(
+        self, gateway: Gateway, pipeline: Pipeline, failure: ProcessFailure | None
+    ) -> StopReport:
+        started_s = time.monotonic()
+        gateway.close_input()
+        if failure is not None:
+            gateway.publish([Event(EventKind.PROCESS_FAILED, gateway.stamp_s, str(failure))])
+        finished = _finish(gateway, pipeline, is_broken=failure is not None)
+        killed = pipeline.stop(max(0.0, started_s + _STOP_S - time.monotonic()))
+        status = gateway.status()
+        gateway.close()
+        return StopReport(self._reason or str(failure), failure, status, finished, killed)
+
+
+def _finish(gateway: Gateway, pipeline: Pipeline, *, is_broken: bool) -> Finished | None:
+    """Process what waits, as far as time allows, and save the map; None without success."""
+    started_s = time.monotonic()
+    finished: Future[Finished] = Future()
+    gateway.finish(finished.set_result)
+    is_bypassed = False
+    while not finished.done() and (elapsed_s := time.monotonic() - started_s) < _SAVE_S:
+        if not pipeline.is_alive(ProcessName.TOPOLOGY):
+            return None
+        if not is_bypassed and (is_broken or not pipeline.is_alive(ProcessName.ODOMETRY)):
+            # Nothing comes through the odometry any more: finish with what the topology has.
+            gateway.discard()
+            pipeline.finish_map()
+            is_bypassed = True
+        if elapsed_s > _DRAIN_S:
+            gateway.discard()
+            pipeline.discard()
+        wait([finished], timeout=_POLL_S)
+    return finished.result() if finished.done() else None
+
+
+def _refuse_second(session: zenoh.Session, keys: Keys) -> None:
+    for reply in session.liveliness().get(keys.liveliness, timeout=_TICK_S):
+        if reply.ok is not None:
+            raise DaemonFailure(f"another daemon serves site {keys.site!r}, robot {keys.robot!r}")

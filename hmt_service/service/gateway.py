@@ -1,0 +1,326 @@
+"""The daemon's side of Zenoh: samples come in, publications and answers go out.
+
+Nothing here takes long: fast calls are answered from the latest values, slow ones are handed to the
+topology process and answered when it has answered.
+
+References:
+    own.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Iterable
+
+import zenoh
+
+from hmt_service import __version__
+from hmt_service.core.config import Config
+from hmt_service.core.types import Event, EventKind, MapMethod, Snapshot, Tracking
+from hmt_service.errors import DaemonFailure, HmtError, Unavailable
+from hmt_service.runtime.localization import Localizer
+from hmt_service.runtime.messages import (
+    CompareRequest,
+    Finished,
+    Mapped,
+    MapRequest,
+    ProcessFailure,
+    ProcessName,
+    Request,
+    Result,
+    RunReport,
+    SaveRequest,
+)
+from hmt_service.runtime.pipeline import Pipeline
+from hmt_service.service.codec import Value, encode
+from hmt_service.service.intake import Intake, IntakeLimits
+from hmt_service.service.keys import Call, Control, Input, Keys, Topic
+from hmt_service.service.questions import Name, Question, receive
+from hmt_service.service.reports import Ack, DaemonState, Status
+
+_LOG = logging.getLogger(__name__)
+_KEPT_EVENTS = 1000
+_ANSWER_S = 8.0
+"""Longest time for a slow call: less than clients wait, so that they learn the reason."""
+_REPORT_S = 1.0
+"""Shortest time between two events about refused input."""
+
+
+class Gateway:
+    """Owner of everything that is declared on Zenoh, and of the latest values to answer from."""
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        keys: Keys,
+        config: Config,
+        pipeline: Pipeline,
+        *,
+        limits: IntakeLimits,
+        shut_down: Callable[[], None],
+    ) -> None:
+        """Prepare; `open` opens.
+
+        Args:
+            session: Where to declare; stays the caller's.
+            keys: Under which names.
+            config: Settings of the mapping core.
+            pipeline: Where readings and slow calls go; stays the caller's.
+            limits: What may wait at the input.
+            shut_down: Called when a client asks for it.
+        """
+        self._session = session
+        self._keys = keys
+        self._config = config
+        self._pipeline = pipeline
+        self._shut_down = shut_down
+        self._intake = Intake(config.sensor, limits, submit=pipeline.submit, finish=pipeline.finish)
+        self._localizer = Localizer()
+        self._snapshot: Snapshot | None = None
+        self._report = RunReport(0, 0.0, 0.0)
+        self._events: deque[Event] = deque(maxlen=_KEPT_EVENTS)
+        self._lock = threading.Lock()
+        self._is_finishing = False
+        self._is_stopping = False
+        self._finished: Finished | None = None
+        self._on_finished: list[Callable[[Finished], None]] = []
+        self._started_s = time.monotonic()
+        self._reported: Counter[str] = Counter()
+        self._reported_s = self._started_s
+
+    def open(self) -> None:
+        """Declare everything, and take input from now on."""
+        self._publishers = {
+            topic: self._session.declare_publisher(self._keys.topic(topic)) for topic in Topic
+        }
+        self._intake.start()
+        # In the receiving thread itself: what a client sent before it asked is in the queue when
+        # its question arrives (measured: with a thread of its own, `finish` overtook up to 50 of
+        # 4,000 scans).
+        on_sample = zenoh.handlers.Callback(self._on_sample, indirect=False)
+        self._subscriber = self._session.declare_subscriber(self._keys.inputs, on_sample)
+        self._queryables = [
+            self._session.declare_queryable(self._keys.calls, self._on_call),
+            self._session.declare_queryable(self._keys.controls, self._on_control),
+        ]
+        self._token = self._session.liveliness().declare_token(self._keys.liveliness)
+
+    def close_input(self) -> None:
+        """Take no more samples, and say so to everybody who asks."""
+        self._is_stopping = True
+        self._subscriber.undeclare()
+
+    def close(self) -> None:
+        """Take everything back; calls that still wait get an error."""
+        with self._lock:
+            waiting, self._on_finished = self._on_finished, []
+        for on_finished in waiting:
+            on_finished(Finished((), "the daemon stopped before it had finished"))
+        self._token.undeclare()
+        for queryable in self._queryables:
+            queryable.undeclare()
+
+    @property
+    def stamp_s(self) -> float:
+        """Stamp of the last reading handed on, s; -inf before the first."""
+        return self._intake.last_stamp_s
+
+    def failure(self) -> ProcessFailure | None:
+        """Return what is wrong when input is no longer processed; None when all is well."""
+        if not self._intake.is_broken:
+            return None
+        reason = "no longer processes its input: see the log"
+        return ProcessFailure(ProcessName.GATEWAY, os.getpid(), reason)
+
+    def tick(self) -> None:
+        """Do what is due at this moment; called a few times per second."""
+        self._pipeline.tick()
+        now = time.monotonic()
+        if now - self._reported_s >= _REPORT_S:
+            self._reported_s = now
+            self._report_refused()
+
+    def finish(self, on_finished: Callable[[Finished], None]) -> None:
+        """Take no more input, process what has arrived, close and save the map.
+
+        Args:
+            on_finished: Called once with the outcome, from any thread.
+        """
+        with self._lock:
+            finished = self._finished
+            if finished is None:
+                self._on_finished.append(on_finished)
+            is_first, self._is_finishing = not self._is_finishing, True
+        if finished is not None:
+            on_finished(finished)
+        elif is_first:
+            self._intake.finish()
+
+    def discard(self) -> None:
+        """Throw away what waits to be decoded."""
+        self._intake.discard()
+
+    def publish(self, events: Iterable[Event]) -> None:
+        """Keep, log and publish events."""
+        for event in events:
+            _LOG.info("%s: %s", event.kind, event.message)
+            self._events.append(event)
+            self._put(Topic.EVENT, event)
+
+    def status(self) -> Status:
+        """Return everything that an operator may ask."""
+        snapshot = self._snapshot
+        return Status(
+            version=__version__,
+            config_hash=self._config.hash(),
+            state=self._state(),
+            uptime_s=time.monotonic() - self._started_s,
+            input=self._intake.counts(),
+            tracked_scans=self._pipeline.tracked_scans,
+            processed_scans=self._report.scans,
+            processes=self._pipeline.status(),
+            revision=snapshot.posterior.revision if snapshot else 0,
+            areas=snapshot.areas if snapshot else 0,
+            arcs=snapshot.arcs if snapshot else 0,
+            keyframes=snapshot.keyframes if snapshot else 0,
+            hypotheses=len(snapshot.posterior.hypotheses) if snapshot else 0,
+        )
+
+    def on_tracking(self, tracking: Tracking) -> None:
+        """Publish where the robot is."""
+        self._localizer.track(tracking)
+        if self._localizer.pose is not None:
+            self._put(Topic.POSE, self._localizer.pose)
+
+    def on_map(self, mapped: Mapped) -> None:
+        """Publish the belief and what has happened to the map."""
+        self._report = mapped.report
+        if mapped.snapshot is not None:
+            self._snapshot = mapped.snapshot
+            self._localizer.update(mapped.snapshot)
+            self._put(Topic.POSTERIOR, mapped.snapshot.posterior)
+        self.publish(mapped.events)
+        if mapped.finished is not None:
+            with self._lock:
+                self._finished = mapped.finished
+                waiting, self._on_finished = self._on_finished, []
+            for on_finished in waiting:
+                on_finished(mapped.finished)
+
+    def _state(self) -> DaemonState:
+        if self._is_stopping:
+            return DaemonState.STOPPING
+        if self._finished is not None:
+            return DaemonState.FINISHED
+        return DaemonState.RUNNING if self._pipeline.is_ready else DaemonState.STARTING
+
+    def _put(self, topic: Topic, value: Value) -> None:
+        message = encode(value)
+        self._publishers[topic].put(message.payload, encoding=message.encoding)
+
+    def _report_refused(self) -> None:
+        refused = Counter(self._intake.counts().refused)
+        new = refused - self._reported
+        if not new:
+            return
+        self._reported = refused
+        reasons = ", ".join(f"{count} {reason}" for reason, count in sorted(new.items()))
+        message = f"{new.total()} samples refused: {reasons}"
+        numbers = {reason: float(count) for reason, count in new.items()}
+        self.publish([Event(EventKind.INPUT_DROPPED, self.stamp_s, message, numbers)])
+
+    def _on_sample(self, sample: zenoh.Sample) -> None:
+        name = str(sample.key_expr).rpartition("/")[2]
+        is_known = sample.kind == zenoh.SampleKind.PUT and name in set(Input)
+        self._intake.offer(
+            Input(name) if is_known else None,
+            len(sample.payload),
+            lambda: (sample.payload.to_bytes(), str(sample.encoding)),
+        )
+
+    def _on_call(self, query: zenoh.Query) -> None:
+        receive(query, {call: self._keys.call(call) for call in Call}, self._handle_call)
+
+    def _on_control(self, query: zenoh.Query) -> None:
+        keys = {control: self._keys.control(control) for control in Control}
+        receive(query, keys, self._handle_control)
+
+    def _handle_call(self, question: Question[Call]) -> Value | None:
+        match question.name:
+            case Call.MAP:
+                question.allow("method", "reference", "hypothesis", "points")
+                return self._ask(
+                    question,
+                    MapRequest(
+                        question.choice("method", MapMethod.CONSISTENT),
+                        question.integer("reference"),
+                        question.integer("hypothesis"),
+                        with_points=question.integer("points") != 0,
+                    ),
+                )
+            case Call.AREAS:
+                question.allow("reference", "hypothesis")
+                return self._ask(
+                    question,
+                    MapRequest(
+                        MapMethod.CONSISTENT,
+                        question.integer("reference"),
+                        question.integer("hypothesis"),
+                        with_points=False,
+                    ),
+                )
+            case Call.COMPARE:
+                question.allow("reference", "hypothesis")
+                return self._ask(
+                    question,
+                    CompareRequest(question.integer("reference"), question.integer("hypothesis")),
+                )
+            case _:
+                question.allow()
+                return self._latest(question.name)
+
+    def _handle_control(self, question: Question[Control]) -> Value | None:
+        question.allow()
+        match question.name:
+            case Control.FINISH:
+                self.finish(lambda finished: question.answer(self._finished_ack(finished)))
+                return None
+            case Control.SAVE:
+                return self._ask(question, SaveRequest())
+            case Control.SHUTDOWN:
+                self._shut_down()
+                return self._ack()
+
+    def _latest(self, call: Call) -> Value:
+        match call:
+            case Call.STATUS:
+                return self.status()
+            case Call.EVENTS:
+                return tuple(self._events)
+            case Call.POSE if self._localizer.pose is not None:
+                return self._localizer.pose
+            case Call.POSTERIOR if self._snapshot is not None:
+                return self._snapshot.posterior
+        received = self._intake.counts().received
+        raise Unavailable(f"no {call} yet: the map has no keyframe, {received} samples received")
+
+    def _ask(self, question: Question[Name], request: Request) -> Value | None:
+        """Hand a slow call to the topology process, which has it answered later: no value yet."""
+
+        def on_result(result: Result) -> None:
+            question.answer(self._ack(result) if isinstance(result, tuple) else result)
+
+        self._pipeline.request(request, on_result, timeout_s=_ANSWER_S)
+        return None
+
+    def _finished_ack(self, finished: Finished) -> Ack | HmtError:
+        return DaemonFailure(finished.failure) if finished.failure else self._ack(finished.files)
+
+    def _ack(self, files: tuple[str, ...] = ()) -> Ack:
+        counts = self._intake.counts()
+        refused = sum(counts.refused.values())
+        return Ack(counts.received, counts.accepted, refused, self._report.scans, files)

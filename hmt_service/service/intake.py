@@ -1,0 +1,168 @@
+"""The way in: samples are queued at once, decoded in turn, checked, sorted by time, and handed on.
+
+References:
+    own.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from hmt_service.core.config import SensorConfig
+from hmt_service.core.types import Reading
+from hmt_service.runtime.ordering import ReorderWindow
+from hmt_service.runtime.queues import SizedQueue
+from hmt_service.service.keys import Input
+from hmt_service.service.readings import Refusal, decode_reading
+from hmt_service.service.reports import InputCounts
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class IntakeLimits:
+    """What the way in can hold."""
+
+    sample_bytes: int = 8_000_000
+    """Largest sample; a larger one is refused before it is parsed."""
+    queue_bytes: int = 256_000_000
+    """Samples that may wait."""
+    reorder_s: float = 0.25
+    """How long readings wait for earlier ones, sensor time."""
+    silence_s: float = 0.3
+    """After this time without a sample, wall clock, readings wait no longer."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Sample:
+    name: Input
+    payload: bytes
+    encoding: str
+
+
+class _End:
+    """Marks the place in the queue behind which nothing follows."""
+
+
+class Intake:
+    """Owner of everything that has arrived and is not yet at the odometry."""
+
+    def __init__(
+        self,
+        sensor: SensorConfig,
+        limits: IntakeLimits,
+        *,
+        submit: Callable[[Reading], bool],
+        finish: Callable[[], bool],
+    ) -> None:
+        """Prepare; `start` starts.
+
+        Args:
+            sensor: What the sensor can see.
+            limits: What may wait here.
+            submit: Takes the readings in order, and may block.
+            finish: Called once, behind the last reading.
+        """
+        self._sensor = sensor
+        self._limits = limits
+        self._submit = submit
+        self._finish = finish
+        self._queue: SizedQueue[_Sample | _End] = SizedQueue(limits.queue_bytes)
+        self._window = ReorderWindow(limits.reorder_s)
+        self._thread = threading.Thread(target=self._pump, name="intake", daemon=True)
+        self._lock = threading.Lock()
+        self._is_finished = False
+        self._received = 0
+        self._accepted = 0
+        self._discarded = 0
+        self._refused: Counter[Refusal] = Counter()
+        self._dropped_beams: Counter[Refusal] = Counter()
+
+    def start(self) -> None:
+        """Start to hand readings on."""
+        self._thread.start()
+
+    @property
+    def is_broken(self) -> bool:
+        """Whether the thread here has ended although nobody said `finish`."""
+        return not self._thread.is_alive() and not self._is_finished
+
+    @property
+    def last_stamp_s(self) -> float:
+        """Stamp of the last reading handed on, s; -inf before the first."""
+        return self._window.released_s
+
+    def offer(self, name: Input | None, size: int, read: Callable[[], tuple[bytes, str]]) -> None:
+        """Take a sample, or count why not, at once.
+
+        Args:
+            name: What it was sent as; None when that is unknown here.
+            size: Size of its payload, bytes.
+            read: Returns the payload and its encoding; not called when they are not wanted.
+        """
+        with self._lock:
+            self._received += 1
+            if name is None:
+                self._refused[Refusal.UNKNOWN_KEY] += 1
+            elif size > self._limits.sample_bytes:
+                self._refused[Refusal.TOO_LARGE] += 1
+            elif self._is_finished:
+                self._refused[Refusal.FINISHED] += 1
+            elif not self._queue.offer(_Sample(name, *read()), size):
+                self._refused[Refusal.QUEUE_FULL] += 1
+
+    def finish(self) -> None:
+        """Take nothing more; what has arrived is still handed on."""
+        with self._lock:
+            self._is_finished = True
+            self._queue.put_token(_End())
+            self._queue.close()
+
+    def discard(self) -> None:
+        """Throw away what waits to be decoded."""
+        with self._lock:
+            self._discarded += self._queue.discard()
+
+    def counts(self) -> InputCounts:
+        """Return what became of everything that arrived."""
+        with self._lock:
+            refused = self._refused.total()
+            return InputCounts(
+                received=self._received,
+                accepted=self._accepted,
+                refused={str(k): count for k, count in self._refused.items()},
+                queued=self._received - self._accepted - refused - self._discarded,
+                queued_bytes=self._queue.size_bytes,
+                discarded=self._discarded,
+                reordering=len(self._window),
+                dropped_beams={str(k): count for k, count in self._dropped_beams.items()},
+            )
+
+    def _pump(self) -> None:
+        while True:
+            item = self._queue.get(self._limits.silence_s)
+            match item:
+                case _Sample():
+                    released = self._take(item)
+                case _:
+                    released = self._window.flush()
+            for reading in released:
+                self._submit(reading)
+            if isinstance(item, _End):
+                self._finish()
+                return
+
+    def _take(self, sample: _Sample) -> tuple[Reading, ...]:
+        decoded = decode_reading(sample.name, sample.payload, sample.encoding, self._sensor)
+        if isinstance(decoded, Refusal):
+            released, refusal = None, decoded
+        else:
+            released, refusal = self._window.push(decoded.reading), Refusal.TIME_BACKWARDS
+        with self._lock:
+            if released is None or isinstance(decoded, Refusal):
+                self._refused[refusal] += 1
+                return ()
+            self._accepted += 1
+            self._dropped_beams.update(decoded.dropped_beams)
+            return released

@@ -1,0 +1,125 @@
+"""One call of a client: which one it is, its parameters, and exactly one answer.
+
+References:
+    own.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+from enum import StrEnum
+from typing import Generic, TypeVar
+
+import zenoh
+
+from hmt_service.errors import DaemonFailure, HmtError, InvalidInput, NotFound
+from hmt_service.service.codec import Value, encode
+
+_LOG = logging.getLogger(__name__)
+
+Name = TypeVar("Name", bound=StrEnum)
+Choice = TypeVar("Choice", bound=StrEnum)
+
+
+class Question(Generic[Name]):
+    """A query that waits for its answer, here or in another thread."""
+
+    def __init__(self, query: zenoh.Query, keys: Mapping[Name, str]) -> None:
+        """Read a query.
+
+        Args:
+            query: What Zenoh has received.
+            keys: The key of every call that could be meant.
+
+        Raises:
+            NotFound: If it is none of them.
+            InvalidInput: If a wildcard makes it several of them, or its parameters are malformed.
+        """
+        self._query = query
+        meant = [name for name, key in keys.items() if query.key_expr.intersects(key)]
+        if not meant:
+            raise NotFound(f"no call {query.key_expr}: there are {', '.join(keys)}")
+        if len(meant) > 1:
+            raise InvalidInput(f"{query.key_expr} is several calls at once: {', '.join(meant)}")
+        self.name = meant[0]
+        self._key = keys[self.name]
+        pairs = [pair.partition("=") for pair in str(query.parameters).split(";") if pair]
+        # Names that begin with "_" belong to Zenoh.
+        self._parameters = {name: text for name, _, text in pairs if not name.startswith("_")}
+
+    def allow(self, *names: str) -> None:
+        """Check that there are no parameters but these.
+
+        Raises:
+            InvalidInput: If there are.
+        """
+        unknown = sorted(self._parameters.keys() - set(names))
+        if unknown:
+            known = f"there are {', '.join(names)}" if names else "there are none"
+            raise InvalidInput(f"unknown parameters of {self.name}: {', '.join(unknown)}; {known}")
+
+    def integer(self, name: str) -> int | None:
+        """Return a parameter that is a number >= 0, or None without it.
+
+        Raises:
+            InvalidInput: If it is none.
+        """
+        text = self._parameters.get(name)
+        if text is None:
+            return None
+        if not (text.isascii() and text.isdigit()):
+            raise InvalidInput(f"{name}={text!r} is not an integer >= 0")
+        return int(text)
+
+    def choice(self, name: str, default: Choice) -> Choice:
+        """Return a parameter that is one of the values of the default's type.
+
+        Raises:
+            InvalidInput: If it is none of them.
+        """
+        text = self._parameters.get(name, default)
+        choices = type(default)
+        if text not in set(choices):
+            raise InvalidInput(f"{name}={text!r} is not one of {', '.join(choices)}")
+        return choices(text)
+
+    def answer(self, value: Value | HmtError) -> None:
+        """Send the answer, or the error, and be done with the query."""
+        _reply(self._query, self._key, value)
+
+
+def receive(
+    query: zenoh.Query,
+    keys: Mapping[Name, str],
+    handle: Callable[[Question[Name]], Value | None],
+) -> None:
+    """Let a query be answered, whatever happens.
+
+    Args:
+        query: What Zenoh has received.
+        keys: The key of every call that could be meant.
+        handle: Returns the answer, or None when it has arranged for one to be given later.
+    """
+    key = str(query.key_expr)
+    value: Value | HmtError | None
+    try:
+        question = Question(query, keys)
+        key = keys[question.name]
+        value = handle(question)
+    except HmtError as error:
+        value = error
+    except Exception as error:  # noqa: BLE001 - Zenoh would swallow it, and the client wait in vain
+        _LOG.exception("call %s failed", key)
+        value = DaemonFailure(f"call {key} failed: {error!r}")
+    if value is not None:
+        _reply(query, key, value)
+
+
+def _reply(query: zenoh.Query, key: str, value: Value | HmtError) -> None:
+    message = encode(value)
+    with query:
+        if isinstance(value, HmtError):
+            query.reply_err(message.payload, encoding=message.encoding)
+        else:
+            query.reply(key, message.payload, encoding=message.encoding)

@@ -1,0 +1,96 @@
+"""What the daemon says of itself.
+
+References:
+    own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+
+from hmt_service.runtime.messages import ProcessStatus
+
+
+class DaemonState(StrEnum):
+    """Phase of the daemon's life."""
+
+    STARTING = "starting"
+    """Processes are loading; input is already queued."""
+    RUNNING = "running"
+    """Input is taken, queries are answered."""
+    FINISHED = "finished"
+    """No more input; all queries are answered."""
+    STOPPING = "stopping"
+    """No more input; the map is being saved."""
+
+
+@dataclass(frozen=True, slots=True)
+class InputCounts:
+    """What became of the input: received = accepted + refused + queued + discarded."""
+
+    received: int
+    """Samples that arrived."""
+    accepted: int
+    """Readings that passed every check."""
+    refused: Mapping[str, int]
+    """Samples refused, by reason."""
+    queued: int
+    """Samples that wait to be decoded."""
+    queued_bytes: int
+    """Their size."""
+    discarded: int
+    """Samples thrown away because the daemon had to stop."""
+    reordering: int
+    """Accepted readings that wait for earlier ones to arrive."""
+    dropped_beams: Mapping[str, int]
+    """Single beams dropped from accepted scans, by reason."""
+
+
+@dataclass(frozen=True, slots=True)
+class Status:
+    """Everything that an operator may ask of the daemon."""
+
+    version: str
+    """Version of this package."""
+    config_hash: str
+    """Hash of the settings of the mapping core."""
+    state: DaemonState
+    """Phase of its life."""
+    uptime_s: float
+    """Time since the start, wall clock."""
+    input: InputCounts
+    """What became of the input."""
+    tracked_scans: int
+    """Scans that the odometry has processed."""
+    processed_scans: int
+    """Scans in the map."""
+    processes: tuple[ProcessStatus, ...]
+    """What the children are doing."""
+    revision: int
+    """Map revision; zero, as all below, before the first keyframe."""
+    areas: int
+    """Areas of the best hypothesis."""
+    arcs: int
+    """Arcs of the best hypothesis."""
+    keyframes: int
+    """Keyframes in the map."""
+    hypotheses: int
+    """Hypotheses alive."""
+
+
+@dataclass(frozen=True, slots=True)
+class Ack:
+    """Answer to a call that changes state."""
+
+    received: int
+    """Samples that arrived so far."""
+    accepted: int
+    """Readings that passed every check."""
+    refused: int
+    """Samples refused."""
+    processed_scans: int
+    """Scans in the map."""
+    files: tuple[str, ...] = ()
+    """Names of the files written."""
