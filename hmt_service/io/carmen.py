@@ -171,28 +171,33 @@ class _Words:
         self._words = words
         self._taken = 0
 
-    def numbers(self, count: int) -> FloatArray:
-        words = self._words[self._taken : self._taken + count]
-        if len(words) < count:
-            raise _Malformed(f"{len(words)} words left where {count} numbers should be")
-        self._taken += count
+    def finite(self, count: int) -> list[float]:
+        words = self._take(count)
         try:
-            return np.array(words, dtype=np.float64)
+            numbers = [float(word) for word in words]
         except ValueError as error:
             raise _Malformed(str(error)) from error
-
-    def finite(self, count: int) -> FloatArray:
-        numbers = self.numbers(count)
-        if not np.isfinite(numbers).all():
+        if not all(map(math.isfinite, numbers)):
             raise _Malformed(f"not finite: {numbers}")
         return numbers
 
     def counted(self) -> FloatArray:
         """Take a count and as many numbers."""
-        count = float(self.finite(1)[0])
+        (count,) = self.finite(1)
         if count < 0 or not count.is_integer():
             raise _Malformed(f"{count} is no count")
-        return self.numbers(int(count))
+        words = self._take(int(count))
+        try:
+            return np.array(words, dtype=np.float64)
+        except ValueError as error:
+            raise _Malformed(str(error)) from error
+
+    def _take(self, count: int) -> list[bytes]:
+        words = self._words[self._taken : self._taken + count]
+        if len(words) < count:
+            raise _Malformed(f"{len(words)} words left where {count} numbers should be")
+        self._taken += count
+        return words
 
     def ranges(self) -> FloatArray:
         """Take a count and as many ranges; an infinite one is a beam without return."""
@@ -204,15 +209,14 @@ class _Words:
         return ranges
 
     def pose(self) -> Pose:
-        x_m, y_m, yaw_rad = self.finite(3).tolist()
-        return planar_pose(x_m, y_m, yaw_rad)
+        return planar_pose(*self.finite(3))
 
     def stamp_s(self) -> float:
         """Take the ipc time, which must be followed by exactly the host and the logger's time."""
         left = len(self._words) - self._taken
         if left != _WORDS_IN_TIME:
             raise _Malformed(f"{left} words left where time, host and time should be")
-        return float(self.finite(1)[0])
+        return self.finite(1)[0]
 
 
 def _odom(words: _Words, _: _Limits) -> tuple[Reading, ...]:
@@ -262,7 +266,7 @@ _PARSERS: dict[bytes, Callable[[_Words, _Limits], tuple[Reading, ...]]] = {
 
 def _configured_sweep(words: _Words) -> tuple[FloatArray, FloatArray]:
     """Take CONFIG, ranges and remissions; return ranges (inf: no return) and directions."""
-    _, start_rad, _, step_rad, sensor_max_m, _, _ = words.finite(_WORDS_IN_CONFIG).tolist()
+    _, start_rad, _, step_rad, sensor_max_m, _, _ = words.finite(_WORDS_IN_CONFIG)
     if step_rad <= 0.0:
         raise _Malformed(f"beams {step_rad} rad apart")
     ranges_m = words.ranges()
