@@ -42,11 +42,11 @@ class OdometryConfig(Section):
     """Edge of the cells that the local map is stored in."""
     points_per_voxel: int = Field(default=20, ge=1)
     """Most points kept in one cell."""
-    window_keyframes: int = Field(default=30, ge=1)
+    window_keyframes: int = Field(default=40, ge=1)
     """Number of latest keyframes in the local map."""
-    max_correspondence_m: float = Field(default=0.5, gt=0.0)
+    max_correspondence_m: float = Field(default=0.3, gt=0.0)
     """Farthest point that a scan point may be matched with."""
-    kernel_m: float = Field(default=0.15, gt=0.0)
+    kernel_m: float = Field(default=0.05, gt=0.0)
     """Scale of the robust kernel (Geman-McClure)."""
     keyframe_distance_m: float = Field(default=0.5, gt=0.0)
     """Motion that makes a keyframe."""
@@ -77,17 +77,25 @@ class MotionConfig(Section):
     """Least standard deviation of a translation."""
     sigma_floor_rad: float = Field(default=0.01, gt=0.0)
     """Least standard deviation of a rotation."""
+    constant_velocity_factor: float = Field(default=5.0, ge=1.0)
+    """How many times less the motion is known without odometry, from constant velocity."""
 
 
 class CovarianceConfig(Section):
     """From a registration's information to an honest covariance."""
 
-    sigma_m: float = Field(default=0.1, gt=0.0)
+    sigma_m: float = Field(default=0.02, gt=0.0)
     """Standard deviation of one point-to-plane residual, including the correlation between points."""
     floor_m: float = Field(default=0.005, gt=0.0)
     """Least standard deviation of a registered translation."""
     floor_rad: float = Field(default=0.002, gt=0.0)
     """Least standard deviation of a registered rotation."""
+    sigma_submap_m: float = Field(default=0.1, gt=0.0)
+    """Standard deviation of one residual between two submaps: they are bent as well as noisy."""
+    floor_submap_m: float = Field(default=0.015, gt=0.0)
+    """Least standard deviation of the translation between two submaps."""
+    floor_submap_rad: float = Field(default=0.004, gt=0.0)
+    """Least standard deviation of the rotation between two submaps."""
 
 
 class AreaConfig(Section):
@@ -118,6 +126,32 @@ class AlignmentConfig(Section):
     """Distance below which a point counts as explained."""
 
 
+class TransitionConfig(Section):
+    """Topological transition (section IV-A)."""
+
+    presence_m: float = Field(default=1.5, gt=0.0)
+    """The robot is inside a known area when it is this near to where it has been there."""
+    margin_share: float = Field(default=0.25, ge=0.0)
+    """Share of a submap's reach by which an area extends beyond where the robot has been."""
+    max_candidates: int = Field(default=8, ge=1)
+    """Most known areas that one entry is compared with: the nearest."""
+    prior_samples: int = Field(default=256, ge=16)
+    """Samples for the prior mass outside all known areas."""
+
+
+class RefinementConfig(Section):
+    """Arcs to all that a finished visit overlaps."""
+
+    max_neighbours: int = Field(default=5, ge=0)
+    """Most visits that one visit is tied to."""
+    max_gap_m: float = Field(default=2.0, ge=0.0)
+    """Farthest that the nearest points of the two paths may be apart."""
+    max_sigma_m: float = Field(default=0.5, gt=0.0)
+    """Largest standard deviation of the relative position: beyond it, the topology is in doubt."""
+    max_sigma_rad: float = Field(default=0.1, gt=0.0)
+    """Largest standard deviation of the relative heading."""
+
+
 class ObservationConfig(Section):
     """Likelihood of a scan given a submap, and the background density (section 2.3 of the design)."""
 
@@ -136,8 +170,6 @@ class ParticleConfig(Section):
 
     budget: int = Field(default=15, ge=1)
     """Most hypotheses kept."""
-    min_ess_share: float = Field(default=0.5, ge=0.0, le=1.0)
-    """Resample when the effective sample size falls below this share of the hypotheses."""
     negligible_mass: float = Field(default=1e-6, gt=0.0, lt=1.0)
     """Hypotheses below this posterior mass are dropped."""
 
@@ -157,6 +189,10 @@ class Config(Section):
     """Area abstraction."""
     alignment: AlignmentConfig = AlignmentConfig()
     """Submap alignment."""
+    transition: TransitionConfig = TransitionConfig()
+    """Topological transition."""
+    refinement: RefinementConfig = RefinementConfig()
+    """Refinement of finished visits."""
     observation: ObservationConfig = ObservationConfig()
     """Observation model."""
     particles: ParticleConfig = ParticleConfig()

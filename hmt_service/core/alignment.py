@@ -1,0 +1,207 @@
+"""Alignment of two submaps: all relative poses that their contents allow inside a prior, each with its covariance.
+
+References:
+    Design section 2.4, step 2 (correlation of bird's-eye views over rotations, then registration).
+    Censi, An accurate closed-form estimate of ICP's covariance, ICRA 2007.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import fft, ndimage
+
+from hmt_service.core.config import Config
+from hmt_service.core.geometry import (
+    FloatArray,
+    GaussianPose,
+    Pose,
+    inverse,
+    log,
+    planar_covariance,
+    planar_pose,
+    transform_points,
+    yaw_of,
+)
+from hmt_service.core.registration import covariance_of
+from hmt_service.core.submap import Visit
+
+# A prior this tight leaves one basin of attraction: registration finds it without a search.
+_SINGLE_BASIN_M = 0.25
+_SINGLE_BASIN_RAD = 0.05
+_SEPARATION_M = 0.6
+_SEPARATION_RAD = 0.15
+_PEAK_SHARE = 0.6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mode:
+    """One way to lay a visit's submap over another."""
+
+    target_from_visit: GaussianPose
+    """Relative pose by registration, with the covariance of the registration."""
+    overlap: float
+    """Share of the visit's points that the target explains there, in [0, 1]."""
+
+
+class Aligner:
+    """Finds the modes of the relative pose of two submaps."""
+
+    def __init__(self, config: Config) -> None:
+        """Build the aligner.
+
+        Args:
+            config: Settings of all stages.
+        """
+        self._config = config.alignment
+        self._covariance = config.covariance
+        self._is_planar = config.sensor.is_planar
+
+    def modes(self, visit: Visit, target: Visit, prior: GaussianPose) -> tuple[Mode, ...]:
+        """Return every pose inside the gate of the prior at which the submaps agree.
+
+        Args:
+            visit: What is to be placed.
+            target: Where it may be.
+            prior: Belief about `target_from_visit` before looking at the submaps.
+
+        Returns:
+            Distinct modes, the one with most overlap first; empty when nothing agrees.
+        """
+        guesses = self._guesses(visit, target, prior)
+        refined = [mode for guess in guesses if (mode := self.refine(visit, target, guess))]
+        refined = [mode for mode in refined if self._is_in_gate(mode, prior)]
+        return self._distinct(refined)
+
+    def refine(self, visit: Visit, target: Visit, guess: Pose) -> Mode | None:
+        """Return the mode whose basin a guess lies in, or None when the submaps disagree there."""
+        config = self._config
+        pose: Pose | None = guess
+        # Coarse to fine: the first pass bridges the raster, the second the voxel.
+        for reach_m in (4.0 * config.inlier_m, 1.5 * config.inlier_m):
+            pose = target.registration_map.register(
+                visit.points, pose, max_correspondence_m=reach_m, kernel_m=0.3 * reach_m
+            )
+            if pose is None:
+                return None
+        match = target.registration_map.match(visit.points, pose, inlier_m=config.inlier_m)
+        if match.inlier_share < config.min_overlap:
+            return None
+        covariance = covariance_of(
+            match.information, sigma_m=self._covariance.sigma_submap_m, is_planar=self._is_planar
+        )
+        floor = self._covariance
+        covariance += np.diag([floor.floor_submap_rad**2] * 3 + [floor.floor_submap_m**2] * 3)
+        if self._is_planar:
+            covariance = planar_covariance(covariance)
+        return Mode(GaussianPose(pose, covariance), match.inlier_share)
+
+    def _guesses(self, visit: Visit, target: Visit, prior: GaussianPose) -> list[Pose]:
+        sigmas = np.sqrt(np.diag(prior.covariance))
+        position = _position_covariance(prior, visit.centre)
+        sigma_m = float(np.sqrt(np.linalg.eigvalsh(position)[-1]))
+        if sigma_m < _SINGLE_BASIN_M and sigmas[2] < _SINGLE_BASIN_RAD:
+            return [prior.mean]
+        return self._correlate(visit, target, prior, float(sigmas[2]), sigma_m)
+
+    def _correlate(
+        self, visit: Visit, target: Visit, prior: GaussianPose, sigma_rad: float, sigma_m: float
+    ) -> list[Pose]:
+        """Return the best poses on a raster: correlation by FFT, one rotation at a time."""
+        config = self._config
+        cell = config.raster_m
+        reach_rad = min(np.pi, config.gate_sigma * sigma_rad)
+        reach_m = config.gate_sigma * sigma_m + cell
+        steps = int(np.ceil(reach_rad / config.angle_step_rad))
+        turns = np.unique(np.linspace(-reach_rad, reach_rad, 2 * steps + 1))
+
+        target_points = target.points[:, :2]
+        low = target_points.min(axis=0) - cell
+        height, width = np.ceil((target_points.max(axis=0) + cell - low) / cell).astype(int) + 1
+        raster = np.zeros((height, width), dtype=np.float32)
+        i, j = ((target_points - low) / cell).astype(int).T
+        raster[i, j] = 1.0
+        raster = np.minimum(ndimage.gaussian_filter(raster, 0.7) * 3.0, 1.0)
+
+        centred = visit.points - visit.centre
+        extent = int(np.ceil(np.abs(centred[:, :2]).max() * np.sqrt(2.0) / cell)) + 1
+        shape = tuple(fft.next_fast_len(int(n) + 2 * extent + 1, real=True) for n in (height, width))
+        spectrum = fft.rfft2(raster, shape)
+        # Where the middle of the visit is expected to be in the target's frame.
+        expected = transform_points(prior.mean, visit.centre[None])[0]
+        rows = low[0] + (np.arange(shape[0]) - extent + 0.5) * cell
+        columns = low[1] + (np.arange(shape[1]) - extent + 0.5) * cell
+        is_inside = (rows[:, None] - expected[0]) ** 2 + (
+            columns[None, :] - expected[1]
+        ) ** 2 <= reach_m**2
+        if not np.any(is_inside):
+            return []
+        scores = []
+        for turn in turns:
+            yaw = yaw_of(prior.mean) + turn
+            rotated = transform_points(planar_pose(0.0, 0.0, yaw), centred)[:, :2]
+            stamp = np.zeros(shape, dtype=np.float32)
+            occupied = np.unique(np.round(rotated / cell).astype(int), axis=0)
+            stamp[occupied[:, 0] % shape[0], occupied[:, 1] % shape[1]] = 1.0 / len(occupied)
+            score = fft.irfft2(spectrum * np.conj(fft.rfft2(stamp)), shape)
+            # Index k stands for a shift by k cells, wrapped; row 0 of `rows` is shift -extent.
+            score = np.roll(score, (extent, extent), axis=(0, 1))
+            scores.append(np.where(is_inside, score, 0.0).astype(np.float32))
+        return self._peaks(np.stack(scores), turns, rows, columns, visit, prior)
+
+    def _peaks(
+        self,
+        scores: np.ndarray,
+        turns: FloatArray,
+        rows: FloatArray,
+        columns: FloatArray,
+        visit: Visit,
+        prior: GaussianPose,
+    ) -> list[Pose]:
+        """Return the poses of the separate local maxima of the correlation, best first."""
+        config = self._config
+        width = 2 * int(np.ceil(_SEPARATION_M / config.raster_m)) + 1
+        depth = 2 * int(np.ceil(_SEPARATION_RAD / config.angle_step_rad)) + 1
+        highest = ndimage.maximum_filter(scores, size=(min(depth, len(turns)), width, width))
+        least = max(_PEAK_SHARE * float(scores.max()), 0.5 * config.min_overlap)
+        found = np.argwhere((scores == highest) & (scores >= least))
+        order = np.argsort(-scores[tuple(found.T)], kind="stable")[: 2 * config.max_modes]
+        poses = []
+        for turn, row, column in found[order]:
+            pose = prior.mean @ planar_pose(0.0, 0.0, 0.0)
+            pose[:3, :3] = planar_pose(0.0, 0.0, float(turns[turn]))[:3, :3] @ prior.mean[:3, :3]
+            centre = pose[:3, :3] @ visit.centre
+            pose[:2, 3] = rows[row] - centre[0], columns[column] - centre[1]
+            poses.append(pose)
+        return poses
+
+    def _is_in_gate(self, mode: Mode, prior: GaussianPose) -> bool:
+        together = GaussianPose(prior.mean, prior.covariance + mode.target_from_visit.covariance)
+        return together.mahalanobis2(mode.target_from_visit.mean) <= self._config.gate_sigma**2 + 6.0
+
+    def _distinct(self, modes: list[Mode]) -> tuple[Mode, ...]:
+        kept: list[Mode] = []
+        for mode in sorted(modes, key=lambda mode: -mode.overlap):
+            apart = [
+                log(inverse(other.target_from_visit.mean) @ mode.target_from_visit.mean)
+                for other in kept
+            ]
+            if all(
+                np.linalg.norm(xi[3:]) > _SEPARATION_M or np.linalg.norm(xi[:3]) > _SEPARATION_RAD
+                for xi in apart
+            ):
+                kept.append(mode)
+        return tuple(kept[: self._config.max_modes])
+
+
+def _position_covariance(pose: GaussianPose, point: FloatArray) -> FloatArray:
+    """Return the covariance of a point carried by an uncertain pose, shape (2, 2), m^2.
+
+    To first order `d(T p) = R (rho - p x phi)`; only the horizontal part counts for the search.
+    """
+    skew = np.array(
+        [[0.0, -point[2], point[1]], [point[2], 0.0, -point[0]], [-point[1], point[0], 0.0]]
+    )
+    jacobian = pose.mean[:3, :3] @ np.hstack([-skew, np.eye(3)])
+    return np.asarray((jacobian @ pose.covariance @ jacobian.T)[:2, :2])

@@ -1,0 +1,457 @@
+"""The engine: keyframes become areas, areas become hypotheses, hypotheses become maps.
+
+`Engine.process` is the paper's Fig. 8 without its threads: area abstraction, topological Bayesian inference, weights,
+graph. It is a plain object without clock, thread, file or socket; the same trackings and the same seed give the same
+map, bit for bit.
+
+References:
+    Blanco et al. 2008, section V and Fig. 8.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from hmt_service.core.alignment import Aligner
+from hmt_service.core.area_abstraction import overlap_of, partition
+from hmt_service.core.composition import arcs_of, compose_shortest_paths, residual_m
+from hmt_service.core.config import Config
+from hmt_service.core.geometry import GaussianPose, Pose, certain, identity, inverse, log
+from hmt_service.core.graph import Factor, PoseGraph
+from hmt_service.core.hypotheses import Assignment, Hypothesis, ParticleLayer
+from hmt_service.core.observation import ObservationModel
+from hmt_service.core.stored import (
+    StoredAssignment,
+    StoredFactor,
+    StoredHypothesis,
+    StoredMap,
+    StoredScan,
+    StoredVisit,
+)
+from hmt_service.core.submap import Visit, as_points, visit_of
+from hmt_service.core.refinement import Refinement
+from hmt_service.core.transition import Successor, Transition
+from hmt_service.core.types import (
+    ArcResidual,
+    AreaDifference,
+    Comparison,
+    Event,
+    EventKind,
+    GlobalMap,
+    HmtPose,
+    Keyframe,
+    MapMethod,
+    PlacedArea,
+    Points,
+    Posterior,
+    Snapshot,
+    StampedPose,
+    Tracking,
+)
+from hmt_service.errors import NotFound, Unavailable
+
+
+class Engine:
+    """Builds the hybrid metric-topological map from tracked scans."""
+
+    def __init__(self, config: Config, *, seed: int = 0) -> None:
+        """Start with an empty map.
+
+        Args:
+            config: Settings of all stages.
+            seed: Seed of all randomness.
+        """
+        self._config = config
+        self._seed = seed
+        rng = np.random.default_rng(seed)
+        aligner = Aligner(config)
+        self._observation = ObservationModel(config.observation, config.sensor)
+        self._transition = Transition(config, aligner, self._observation, rng)
+        self._refinement = Refinement(config, aligner)
+        self._particles = ParticleLayer(
+            budget=config.particles.budget,
+            negligible_mass=config.particles.negligible_mass,
+            rng=rng,
+        )
+        self._visits: dict[int, Visit] = {}
+        self._motions: list[Factor] = []
+        self._trackings: list[Tracking] = []
+        self._next_hypothesis = 0
+        self._revision = 0
+
+    # ------------------------------------------------------------------ from scans to hypotheses
+
+    def process(self, tracking: Tracking) -> tuple[Event, ...]:
+        """Take what the odometry says of one scan.
+
+        Args:
+            tracking: The scan's pose relative to its keyframe, and the keyframe if it became one.
+
+        Returns:
+            What was decided because of it.
+        """
+        self._trackings.append(tracking)
+        keyframe = tracking.keyframe
+        if keyframe is None:
+            return ()
+        self._revision += 1
+        self._observation.learn(keyframe)
+        if not self._visits:
+            return self._begin(keyframe)
+        events: tuple[Event, ...] = ()
+        if keyframe.failure is not None:
+            return self._enter(self._open.with_keyframe(keyframe), len(self._open.keyframes))
+        self._visits[self._open.visit] = self._open.with_keyframe(keyframe)  # metric SLAM
+        events += self._weigh(keyframe)  # Eq. (12)
+        areas = self._config.areas
+        split = partition(  # AAM
+            overlap_of(self._open.cells), max_cut=areas.max_cut, min_keyframes=areas.min_keyframes
+        )
+        if split is not None:
+            events += self._enter(self._open, split.first_of_new)  # TSBI
+        return events
+
+    def finish(self) -> tuple[Event, ...]:
+        """Refine what the last visit says; more trackings may follow.
+
+        Returns:
+            What was decided.
+        """
+        if self._visits:
+            self._refine(self._open)
+            self._revision += 1
+        return ()
+
+    @property
+    def _open(self) -> Visit:
+        return self._visits[len(self._visits) - 1]
+
+    def _begin(self, keyframe: Keyframe) -> tuple[Event, ...]:
+        self._visits[0] = visit_of(0, (keyframe,), self._config)
+        graph = PoseGraph(is_planar=self._config.sensor.is_planar)
+        graph.add_reference(0)
+        first = Hypothesis(self._new_identifier(), 0.0, (Assignment(0, 0, None),), graph)
+        self._particles.replace([first])
+        return (self._entered(keyframe.stamp_s),)
+
+    def _enter(self, visit: Visit, first_of_new: int) -> tuple[Event, ...]:
+        """Close the open visit at a border and expand every hypothesis over what lies beyond it."""
+        closed, opened, motion = visit.split(first_of_new)
+        self._visits[closed.visit] = closed
+        self._refine(closed)
+        arc = Factor(closed.visit, opened.visit, motion)
+        self._motions.append(arc)
+        expanded = [
+            successor
+            for hypothesis in self._particles.hypotheses
+            for successor in self._expand(hypothesis, opened, arc)
+        ]
+        self._visits[opened.visit] = opened
+        stamp_s = opened.keyframes[-1].stamp_s
+        pruned = self._pruned(self._particles.replace(expanded), stamp_s)
+        return (self._entered(stamp_s), *self._branched(len(expanded), stamp_s), *pruned)
+
+    def _expand(self, hypothesis: Hypothesis, visit: Visit, arc: Factor) -> list[Hypothesis]:
+        """Return one hypothesis per place that the visit may be to, Eq. (6)."""
+        successors = self._transition.successors(hypothesis, visit, arc, self._visits)
+        return [
+            hypothesis.extended(
+                _assignment(visit.visit, successor),
+                arc,
+                hypothesis=self._new_identifier(),
+                log_weight=hypothesis.log_weight + successor.log_factor,
+            )
+            for successor in successors
+        ]
+
+    def _weigh(self, keyframe: Keyframe) -> tuple[Event, ...]:
+        """Multiply the weights by the predictive likelihood of a keyframe, Eq. (12)."""
+        if len(self._particles.hypotheses) == 1:
+            return ()
+        visit_from_keyframe = self._open.visit_from_keyframe[-1].mean
+
+        def log_likelihood(hypothesis: Hypothesis) -> float:
+            current = hypothesis.current
+            if current.area_from_visit is None:
+                return 0.0
+            pose = current.area_from_visit.mean @ visit_from_keyframe
+            submap = self._visits[current.area].points
+            return self._observation.log_ratio(keyframe, submap, pose)
+
+        return self._pruned(self._particles.reweight(log_likelihood), keyframe.stamp_s)
+
+    def _refine(self, visit: Visit) -> None:
+        """Let every hypothesis use all of a visit that is over, not only its beginning."""
+        self._particles.replace(
+            [
+                self._refinement.refine(hypothesis, visit, self._visits)
+                for hypothesis in self._particles.hypotheses
+            ]
+        )
+
+    def _new_identifier(self) -> int:
+        self._next_hypothesis += 1
+        return self._next_hypothesis - 1
+
+    # ------------------------------------------------------------------ what happened
+
+    def _entered(self, stamp_s: float) -> Event:
+        best = self._particles.best
+        numbers = {
+            "area": float(best.current.area),
+            "probability": float(self._particles.probabilities[0]),
+            "hypotheses": float(len(self._particles.hypotheses)),
+        }
+        kind = "known" if best.current.area_from_visit is not None else "new"
+        message = f"entered {kind} area {best.current.area}"
+        return Event(EventKind.AREA_ENTERED, stamp_s, message, numbers)
+
+    def _branched(self, expanded: int, stamp_s: float) -> tuple[Event, ...]:
+        if expanded == 1:
+            return ()
+        numbers = {
+            "successors": float(expanded),
+            "kept": float(len(self._particles.hypotheses)),
+            "effective_sample_size": self._particles.effective_sample_size,
+        }
+        return (Event(EventKind.BRANCHED, stamp_s, f"{expanded} successors", numbers),)
+
+    def _pruned(self, dropped: tuple[Hypothesis, ...], stamp_s: float) -> tuple[Event, ...]:
+        return tuple(
+            Event(
+                EventKind.PRUNED,
+                stamp_s,
+                f"dropped hypothesis {h.hypothesis} in area {h.current.area}",
+                {"hypothesis": float(h.hypothesis), "log_weight": h.log_weight},
+            )
+            for h in dropped
+        )
+
+    # ------------------------------------------------------------------ what readers may ask
+
+    def snapshot(self) -> Snapshot | None:
+        """Return the state that readers may know; None before the first keyframe."""
+        if not self._visits:
+            return None
+        best, visit = self._particles.best, self._open
+        summaries = self._particles.summaries()
+        marginal: dict[int, float] = {}
+        for summary in summaries:
+            area = summary.current_area
+            marginal[area] = marginal.get(area, 0.0) + summary.probability
+        visit_from_keyframe = visit.visit_from_keyframe[-1]
+        return Snapshot(
+            posterior=Posterior(
+                stamp_s=visit.keyframes[-1].stamp_s,
+                revision=self._revision,
+                hypotheses=summaries,
+                current_area=marginal,
+                effective_sample_size=self._particles.effective_sample_size,
+            ),
+            keyframe_index=visit.last_keyframe,
+            area_from_keyframe=best.area_from_visit(visit.visit) @ visit_from_keyframe,
+            reference_from_keyframe=best.graph.relative(0, visit.visit) @ visit_from_keyframe,
+            reference_area=0,
+            areas=len(best.areas),
+            arcs=len(arcs_of(best, self._motions)),
+            keyframes=visit.last_keyframe + 1,
+        )
+
+    def global_map(
+        self,
+        method: MapMethod,
+        *,
+        reference_area: int | None = None,
+        hypothesis: int | None = None,
+        with_points: bool = True,
+    ) -> GlobalMap:
+        """Return all areas of one hypothesis in one frame (section IV-C).
+
+        Args:
+            method: Globally consistent, or composed along shortest paths.
+            reference_area: Area whose frame is used; None for the first area.
+            hypothesis: Identifier; None for the most probable one.
+            with_points: Whether the submaps come with it.
+
+        Raises:
+            Unavailable: Before the first keyframe.
+            NotFound: If there is no such area or hypothesis.
+        """
+        chosen, probability = self._choose(hypothesis)
+        reference = self._reference(chosen, reference_area)
+        arcs = arcs_of(chosen, self._motions)
+        if method is MapMethod.CONSISTENT:
+            poses = {area: chosen.graph.relative(reference, area) for area in chosen.areas}
+        else:
+            rng = np.random.default_rng([self._seed, self._revision])
+            poses = compose_shortest_paths(arcs, reference, rng)
+        areas = tuple(
+            PlacedArea(
+                area=area,
+                reference_from_area=poses[area],
+                keyframes=sum(len(self._visits[v].keyframes) for v in chosen.visits_to(area)),
+                visits=len(chosen.visits_to(area)),
+                points_in_area=self._submap(chosen, area) if with_points else _NO_POINTS,
+            )
+            for area in chosen.areas
+        )
+        return GlobalMap(
+            method=method,
+            reference_area=reference,
+            hypothesis=chosen.hypothesis,
+            probability=probability,
+            revision=self._revision,
+            areas=areas,
+            arcs=arcs,
+        )
+
+    def compare(
+        self, *, reference_area: int | None = None, hypothesis: int | None = None
+    ) -> Comparison:
+        """Return the shortest-path map against the consistent one, area by area and arc by arc.
+
+        Raises:
+            Unavailable: Before the first keyframe.
+            NotFound: If there is no such area or hypothesis.
+        """
+        consistent, shortest = (
+            self.global_map(
+                method,
+                reference_area=reference_area,
+                hypothesis=hypothesis,
+                with_points=False,
+            )
+            for method in (MapMethod.CONSISTENT, MapMethod.SHORTEST_PATH)
+        )
+        differences = tuple(
+            _difference(c.area, c.reference_from_area, s.reference_from_area)
+            for c, s in zip(consistent.areas, shortest.areas, strict=True)
+        )
+        consistent_poses, shortest_poses = _means(consistent), _means(shortest)
+        residuals = tuple(
+            ArcResidual(
+                arc.area_a,
+                arc.area_b,
+                residual_m(arc, consistent_poses),
+                residual_m(arc, shortest_poses),
+            )
+            for arc in consistent.arcs
+        )
+        return Comparison(
+            reference_area=consistent.reference_area,
+            hypothesis=consistent.hypothesis,
+            revision=consistent.revision,
+            areas=differences,
+            arcs=residuals,
+        )
+
+    def trajectory(self) -> tuple[StampedPose, ...]:
+        """Return the globally consistent pose of every scan in the most probable hypothesis."""
+        if not self._visits:
+            return ()
+        graph = self._particles.best.graph
+        reference_from_keyframe: dict[int, Pose] = {}
+        for visit in self._visits.values():
+            reference_from_visit = graph.pose(visit.visit)
+            for keyframe, pose in zip(visit.keyframes, visit.visit_from_keyframe, strict=True):
+                reference_from_keyframe[keyframe.index] = reference_from_visit @ pose.mean
+        return tuple(
+            StampedPose(
+                tracking.stamp_s,
+                reference_from_keyframe[tracking.keyframe_index]
+                @ tracking.keyframe_from_body.mean,
+            )
+            for tracking in self._trackings
+            if tracking.keyframe_index in reference_from_keyframe
+        )
+
+    def stored(self) -> StoredMap:
+        """Return everything that a map file needs to hold."""
+        return StoredMap(
+            revision=self._revision,
+            seed=self._seed,
+            config_json=self._config.model_dump_json(),
+            keyframes=tuple(k for visit in self._visits.values() for k in visit.keyframes),
+            visits=tuple(
+                StoredVisit(visit.visit, visit.first_keyframe, visit.last_keyframe)
+                for visit in self._visits.values()
+            ),
+            hypotheses=tuple(_stored(h) for h in self._particles.hypotheses),
+            scans=tuple(
+                StoredScan(t.stamp_s, t.keyframe_index, t.keyframe_from_body.mean)
+                for t in self._trackings
+            ),
+        )
+
+    def _choose(self, hypothesis: int | None) -> tuple[Hypothesis, float]:
+        if not self._visits:
+            raise Unavailable("there is no map yet: no keyframe has been seen")
+        known = zip(self._particles.hypotheses, self._particles.probabilities, strict=True)
+        for candidate, probability in known:
+            if hypothesis is None or candidate.hypothesis == hypothesis:
+                return candidate, float(probability)
+        identifiers = [h.hypothesis for h in self._particles.hypotheses]
+        raise NotFound(f"hypothesis {hypothesis} is not one of {identifiers}")
+
+    @staticmethod
+    def _reference(hypothesis: Hypothesis, area: int | None) -> int:
+        reference = hypothesis.areas[0] if area is None else area
+        if reference not in hypothesis.areas:
+            raise NotFound(
+                f"area {area} is not in hypothesis {hypothesis.hypothesis}, "
+                f"which has {len(hypothesis.areas)} areas: {list(hypothesis.areas)}"
+            )
+        return reference
+
+    def _submap(self, hypothesis: Hypothesis, area: int) -> Points:
+        """Return the points of all visits to an area, in its frame."""
+        area_from_reference = inverse(hypothesis.graph.pose(area))
+        clouds = [
+            self._visits[visit].points_in(area_from_reference @ hypothesis.graph.pose(visit))
+            for visit in hypothesis.visits_to(area)
+        ]
+        return as_points(np.concatenate(clouds))
+
+
+_NO_POINTS: Points = np.zeros((0, 3), dtype=np.float32)
+
+
+def _assignment(visit: int, successor: Successor) -> Assignment:
+    if successor.area is None:
+        return Assignment(visit, visit, None)
+    return Assignment(visit, successor.area, successor.area_from_visit)
+
+
+def _means(placed: GlobalMap) -> Mapping[int, Pose]:
+    return {area.area: area.reference_from_area.mean for area in placed.areas}
+
+
+def _difference(area: int, consistent: GaussianPose, shortest: GaussianPose) -> AreaDifference:
+    apart = log(inverse(consistent.mean) @ shortest.mean)
+    return AreaDifference(
+        area=area,
+        translation_m=float(np.linalg.norm(consistent.mean[:3, 3] - shortest.mean[:3, 3])),
+        rotation_rad=float(np.linalg.norm(apart[:3])),
+        sigma_consistent_m=_largest_sigma_m(consistent),
+        sigma_shortest_path_m=_largest_sigma_m(shortest),
+    )
+
+
+def _largest_sigma_m(pose: GaussianPose) -> float:
+    return float(np.sqrt(max(np.linalg.eigvalsh(pose.covariance[3:, 3:])[-1], 0.0)))
+
+
+def _stored(hypothesis: Hypothesis) -> StoredHypothesis:
+    return StoredHypothesis(
+        hypothesis=hypothesis.hypothesis,
+        log_weight=hypothesis.log_weight,
+        assignments=tuple(
+            StoredAssignment(a.visit, a.area, a.area_from_visit) for a in hypothesis.assignments
+        ),
+        reference_from_visit={v: hypothesis.graph.pose(v) for v in hypothesis.graph.visits},
+        factors=tuple(
+            StoredFactor(f.visit_a, f.visit_b, f.a_from_b) for f in hypothesis.graph.factors
+        ),
+    )

@@ -1,0 +1,222 @@
+"""The particle layer: topological hypotheses, each with its own graph and its own probability.
+
+A particle *is* a hypothesis: metric poses are Gaussian inside it (marginalised analytically), so no two particles
+are copies of each other, and resampling is needed only to bound their number.
+
+References:
+    Blanco et al. 2008, Eq. (6), (12)-(14).
+    Fearnhead and Clifford, On-line inference for hidden Markov models via particle filters, JRSS-B 2003,
+    section 4 (optimal resampling).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hmt_service.core.geometry import FloatArray, GaussianPose, certain, identity
+from hmt_service.core.graph import Factor, PoseGraph
+from hmt_service.core.types import HypothesisSummary
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Assignment:
+    """Which area one visit was to, says a hypothesis."""
+
+    visit: int
+    """The visit."""
+    area: int
+    """The area: the visit that founded it."""
+    area_from_visit: GaussianPose | None
+    """Alignment with the founding visit; None when this visit founded the area."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Hypothesis:
+    """One topology of everything that the robot has travelled."""
+
+    hypothesis: int
+    """Identifier, unique in a run."""
+    log_weight: float
+    """Log of the posterior mass."""
+    assignments: tuple[Assignment, ...]
+    """One per visit, in time order: the topological path."""
+    graph: PoseGraph
+    """The metric graph that follows from it; owned, solved on demand."""
+
+    @property
+    def current(self) -> Assignment:
+        """The assignment of the visit that the robot is on."""
+        return self.assignments[-1]
+
+    @property
+    def topological_path(self) -> tuple[int, ...]:
+        """Areas in the order that they were entered."""
+        areas = [assignment.area for assignment in self.assignments]
+        return tuple(
+            area for i, area in enumerate(areas) if i == 0 or areas[i - 1] != area
+        )
+
+    @property
+    def areas(self) -> tuple[int, ...]:
+        """All areas, in the order of their identifiers."""
+        return tuple(a.area for a in self.assignments if a.area_from_visit is None)
+
+    def visits_to(self, area: int) -> tuple[int, ...]:
+        """Return the visits to an area, in time order."""
+        return tuple(a.visit for a in self.assignments if a.area == area)
+
+    def area_from_visit(self, visit: int) -> GaussianPose:
+        """Return the pose of a visit's frame in its area, with its own graph's covariance."""
+        area = self.assignments[visit].area
+        if area == visit:
+            return certain(identity())
+        return self.graph.relative(area, visit)
+
+    def extended(
+        self,
+        assignment: Assignment,
+        arc: Factor,
+        *,
+        hypothesis: int,
+        log_weight: float,
+    ) -> Hypothesis:
+        """Return a successor that has entered one more area.
+
+        Args:
+            assignment: Where the new visit is.
+            arc: Motion from the visit before to the new one.
+            hypothesis: Identifier of the successor.
+            log_weight: Its log weight, not normalised.
+        """
+        graph = self.graph.copy()
+        graph.add_factor(arc)
+        if assignment.area_from_visit is not None:
+            graph.add_factor(Factor(assignment.area, assignment.visit, assignment.area_from_visit))
+        return Hypothesis(hypothesis, log_weight, (*self.assignments, assignment), graph)
+
+
+class ParticleLayer:
+    """The set of hypotheses and their weights."""
+
+    def __init__(self, *, budget: int, negligible_mass: float, rng: np.random.Generator) -> None:
+        """Start without a hypothesis.
+
+        Args:
+            budget: Most hypotheses kept.
+            negligible_mass: Posterior mass below which one is dropped.
+            rng: Source of all randomness of the resampling.
+        """
+        self._budget = budget
+        self._negligible_mass = negligible_mass
+        self._rng = rng
+        self._hypotheses: tuple[Hypothesis, ...] = ()
+
+    @property
+    def hypotheses(self) -> tuple[Hypothesis, ...]:
+        """All hypotheses, the most probable first."""
+        return self._hypotheses
+
+    @property
+    def best(self) -> Hypothesis:
+        """The most probable hypothesis."""
+        return self._hypotheses[0]
+
+    @property
+    def probabilities(self) -> FloatArray:
+        """Posterior mass of each hypothesis, Eq. (14), shape (H,)."""
+        return np.exp([hypothesis.log_weight for hypothesis in self._hypotheses])
+
+    @property
+    def effective_sample_size(self) -> float:
+        """1 / sum of squared weights, in [1, H]."""
+        return float(1.0 / np.sum(self.probabilities**2))
+
+    def replace(self, hypotheses: Sequence[Hypothesis]) -> tuple[Hypothesis, ...]:
+        """Take a new set, normalise it, drop what is negligible and resample down to the budget.
+
+        Args:
+            hypotheses: At least one, with log weights of any common scale.
+
+        Returns:
+            The hypotheses that were dropped, with their last normalised weights.
+        """
+        given = _normalised(hypotheses)
+        kept = [h for h in given if np.exp(h.log_weight) >= self._negligible_mass]
+        if len(kept) > self._budget:
+            weights = np.exp([h.log_weight for h in kept])
+            survivors = optimal_resampling(weights / weights.sum(), self._budget, self._rng)
+            kept = [replace(kept[i], log_weight=float(np.log(weight))) for i, weight in survivors]
+        identifiers = {h.hypothesis for h in kept}
+        self._hypotheses = tuple(
+            sorted(_normalised(kept), key=lambda h: (-h.log_weight, h.hypothesis))
+        )
+        return tuple(h for h in given if h.hypothesis not in identifiers)
+
+    def reweight(self, log_likelihood: Callable[[Hypothesis], float]) -> tuple[Hypothesis, ...]:
+        """Multiply each weight by the predictive likelihood of an observation; see `replace`."""
+        return self.replace(
+            [replace(h, log_weight=h.log_weight + log_likelihood(h)) for h in self._hypotheses]
+        )
+
+    def summaries(self) -> tuple[HypothesisSummary, ...]:
+        """Return what readers may know of each hypothesis, the most probable first."""
+        return tuple(
+            HypothesisSummary(
+                hypothesis=h.hypothesis,
+                probability=float(probability),
+                current_area=h.current.area,
+                topological_path=h.topological_path,
+                areas=len(h.areas),
+                loop_closures=len(h.assignments) - len(h.areas),
+            )
+            for h, probability in zip(self._hypotheses, self.probabilities, strict=True)
+        )
+
+
+def _normalised(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
+    log_weights = np.array([h.log_weight for h in hypotheses])
+    total = np.logaddexp.reduce(log_weights)
+    return [replace(h, log_weight=float(h.log_weight - total)) for h in hypotheses]
+
+
+def optimal_resampling(
+    weights: FloatArray, budget: int, rng: np.random.Generator
+) -> list[tuple[int, float]]:
+    """Return which particles survive, and their weights; unbiased, and exact for heavy ones.
+
+    Args:
+        weights: Normalised weights, shape (N,), N > budget.
+        budget: Number of survivors.
+        rng: Source of the one random number that is drawn.
+
+    Returns:
+        Index and new weight of each survivor, in the order of the indices; weights sum to one in
+        expectation.
+    """
+    threshold = _threshold(weights, budget)
+    is_heavy = weights >= threshold
+    survivors = [(int(i), float(weights[i])) for i in np.flatnonzero(is_heavy)]
+    light = np.flatnonzero(~is_heavy)
+    # Stratified: a comb of equal teeth over the light particles, shifted by one random number.
+    position = rng.uniform(0.0, threshold)
+    cumulative = 0.0
+    for i in light:
+        cumulative += float(weights[i])
+        if cumulative > position:
+            survivors.append((int(i), float(threshold)))
+            position += threshold
+    return sorted(survivors)
+
+
+def _threshold(weights: FloatArray, budget: int) -> float:
+    """Return 1/c with sum(min(c * w, 1)) = budget."""
+    descending = np.sort(weights)[::-1]
+    tails = descending.sum() - np.concatenate([[0.0], np.cumsum(descending)[:-1]])
+    for heavy in range(budget):
+        threshold = tails[heavy] / (budget - heavy)
+        if descending[heavy] < threshold:
+            return float(threshold)
+    return float(descending[budget - 1])

@@ -1,0 +1,125 @@
+"""Observation model p(z | x, submap): a scan against the ranges that a submap predicts, and the background density.
+
+References:
+    Thrun, Burgard, Fox, Probabilistic Robotics, 2005, section 6.3 (beam mixture).
+    Cummins and Newman, FAB-MAP, IJRR 2008 (the alternative to a match is learned, not uniform).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from hmt_service.core.config import ObservationConfig, SensorConfig
+from hmt_service.core.geometry import FloatArray, Pose, inverse, transform_points
+from hmt_service.core.types import Keyframe
+
+_BIN_M = 0.25
+
+
+class BackgroundDensity:
+    """p0(z): the density of one range when nothing is known of the place, learned from what was seen."""
+
+    def __init__(self, max_range_m: float) -> None:
+        """Start uniform, worth one reading per bin.
+
+        Args:
+            max_range_m: Longest range of the sensor.
+        """
+        self._counts = np.ones(int(np.ceil(max_range_m / _BIN_M)))
+
+    def learn(self, ranges: FloatArray) -> None:
+        """Count ranges, shape (N,), m."""
+        np.add.at(self._counts, self._bins(ranges), 1.0)
+
+    def density(self, ranges: FloatArray) -> FloatArray:
+        """Return p0 at each range, shape (N,), 1/m."""
+        return np.asarray(self._counts[self._bins(ranges)] / (self._counts.sum() * _BIN_M))
+
+    def _bins(self, ranges: FloatArray) -> np.ndarray:
+        return np.clip((ranges / _BIN_M).astype(np.int64), 0, len(self._counts) - 1)
+
+
+class ObservationModel:
+    """Likelihood ratio of scans: a known place against the background."""
+
+    def __init__(self, config: ObservationConfig, sensor: SensorConfig) -> None:
+        """Build the model.
+
+        Args:
+            config: Settings of this stage.
+            sensor: What the range sensor can see.
+        """
+        self._config = config
+        self._is_planar = sensor.is_planar
+        self._columns = int(np.ceil(2.0 * np.pi / config.angular_resolution_rad))
+        self._rows = 1 if sensor.is_planar else int(np.ceil(np.pi / config.angular_resolution_rad))
+        self.background = BackgroundDensity(sensor.max_range_m)
+
+    def learn(self, keyframe: Keyframe) -> None:
+        """Let the background density see one keyframe."""
+        self.background.learn(_ranges(keyframe.points_in_body - keyframe.sensor_in_body))
+
+    def log_ratio(self, keyframe: Keyframe, submap: FloatArray, submap_from_body: Pose) -> float:
+        """Return log p(z | x, submap) - log p0(z) of one keyframe, tempered for correlated beams.
+
+        Beams into space that the submap does not know count zero: there, both follow p0.
+
+        Args:
+            keyframe: The observation.
+            submap: Points of the submap, shape (N, 3), m.
+            submap_from_body: Pose of the keyframe in the submap's frame.
+        """
+        rays = keyframe.points_in_body - keyframe.sensor_in_body
+        if not len(rays):
+            return 0.0
+        ranges = _ranges(rays)
+        predicted = transform_points(inverse(submap_from_body), submap) - keyframe.sensor_in_body
+        expected = self._nearest_expectation(predicted, rays, ranges)
+        is_known = np.isfinite(expected)
+        if not np.any(is_known):
+            return 0.0
+        sigma, hit = self._config.hit_sigma_m, self._config.hit_weight
+        residual = (ranges[is_known] - expected[is_known]) / sigma
+        density = np.exp(-0.5 * residual**2) / (np.sqrt(2.0 * np.pi) * sigma)
+        ratio = np.log(hit * density / self.background.density(ranges[is_known]) + (1.0 - hit))
+        return float(ratio.sum() * min(1.0, self._config.independent_beams / len(rays)))
+
+    def log_ratio_of_all(
+        self, keyframes: Iterable[tuple[Keyframe, Pose]], submap: FloatArray
+    ) -> float:
+        """Return the summed log ratio of several keyframes, each with its pose in the submap."""
+        return sum(self.log_ratio(keyframe, submap, pose) for keyframe, pose in keyframes)
+
+    def _nearest_expectation(
+        self, predicted: FloatArray, rays: FloatArray, ranges: FloatArray
+    ) -> FloatArray:
+        """Return the expected range of each beam, inf where the submap has nothing there.
+
+        Of a beam's own cell and its two neighbours, the expectation nearest to the reading counts:
+        on a wall seen at a grazing angle one cell spans metres of range.
+        """
+        grid = np.full(self._rows * self._columns, np.inf)
+        np.minimum.at(grid, self._cells(predicted), _ranges(predicted))
+        cells = self._cells(rays)
+        row, column = np.divmod(cells, self._columns)
+        around = np.stack(
+            [grid[row * self._columns + (column + step) % self._columns] for step in (-1, 0, 1)]
+        )
+        best = np.argmin(np.abs(around - ranges), axis=0)
+        expected = np.take_along_axis(around, best[None], axis=0)[0]
+        return np.where(np.isfinite(grid[cells]), expected, np.inf)
+
+    def _cells(self, rays: FloatArray) -> np.ndarray:
+        azimuth = np.arctan2(rays[:, 1], rays[:, 0]) + np.pi
+        column = np.minimum((azimuth / (2.0 * np.pi) * self._columns).astype(int), self._columns - 1)
+        if self._is_planar:
+            return column
+        elevation = np.arctan2(rays[:, 2], np.hypot(rays[:, 0], rays[:, 1])) + 0.5 * np.pi
+        row = np.minimum((elevation / np.pi * self._rows).astype(int), self._rows - 1)
+        return np.asarray(row * self._columns + column)
+
+
+def _ranges(rays: FloatArray) -> FloatArray:
+    return np.asarray(np.linalg.norm(rays, axis=1))

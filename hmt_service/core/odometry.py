@@ -1,0 +1,245 @@
+"""Metric level: ties each scan to the keyframes before it and picks the next keyframe.
+
+References:
+    Vizzo et al., KISS-ICP, RA-L 2023 (registration against a local voxel map).
+    Blanco et al. 2008, section V ("metric SLAM" process).
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from hmt_service.core.config import Config
+from hmt_service.core.geometry import (
+    PLANAR_AXES,
+    FloatArray,
+    GaussianPose,
+    Pose,
+    certain,
+    exp,
+    identity,
+    inverse,
+    log,
+    planar_covariance,
+    project_planar,
+    symmetric,
+    transform_points,
+)
+from hmt_service.core.registration import RegistrationMap, covariance_of, deskew, voxel_downsample
+from hmt_service.core.types import (
+    Keyframe,
+    OdometryReading,
+    Reading,
+    Scan,
+    Tracking,
+    TrackingFailure,
+)
+
+# chi-square 99.9 % for 3 and 6 degrees of freedom: beyond it, odometry and scan contradict each other.
+_GATE = {3: 16.27, 6: 22.46}
+
+
+class Odometry:
+    """Registers scans against a window of recent keyframes.
+
+    Poses are kept relative to the latest keyframe, so that no number grows with the path; the window
+    knows nothing of areas, and never holds a place seen a loop ago.
+    """
+
+    def __init__(self, config: Config) -> None:
+        """Start without a map.
+
+        Args:
+            config: Settings of all stages.
+        """
+        self._sensor = config.sensor
+        self._config = config.odometry
+        self._motion = config.motion
+        self._covariance = config.covariance
+        self._axes = PLANAR_AXES if config.sensor.is_planar else np.arange(6)
+        self._window: deque[tuple[Pose, FloatArray]] = deque(maxlen=config.odometry.window_keyframes)
+        self._map: RegistrationMap | None = None
+        self._keyframes = 0
+        self._keyframe_from_body = certain(identity())
+        self._last_motion = identity()
+        self._last_stamp_s: float | None = None
+        self._odometry: OdometryReading | None = None
+        self._odometry_at_scan: OdometryReading | None = None
+
+    def process(self, reading: Reading) -> Tracking | None:
+        """Take one reading in time order.
+
+        Args:
+            reading: A scan, or odometry to be used with the next scan.
+
+        Returns:
+            What became of the scan; None for odometry.
+        """
+        if isinstance(reading, OdometryReading):
+            self._odometry = reading
+            return None
+        return self._register(reading)
+
+    def _register(self, scan: Scan) -> Tracking:
+        if self._map is None or self._last_stamp_s is None:
+            return self._add_keyframe(scan, self._points_of(scan), certain(identity()), None)
+        predicted, motion = self._predict(scan.stamp_s)
+        points = self._points_of(scan, motion)
+        posed, failure = self._correct(scan, points, predicted)
+        self._last_motion = inverse(self._keyframe_from_body.mean) @ posed.mean
+        moved = log(posed.mean)
+        is_keyframe = (
+            float(np.linalg.norm(moved[3:])) >= self._config.keyframe_distance_m
+            or float(np.linalg.norm(moved[:3])) >= self._config.keyframe_angle_rad
+        )
+        if is_keyframe and len(points):
+            return self._add_keyframe(scan, points, posed, failure)
+        self._keyframe_from_body = posed
+        self._remember(scan)
+        return Tracking(scan.stamp_s, self._keyframes - 1, posed, None, failure)
+
+    def _points_of(self, scan: Scan, motion: Pose | None = None) -> FloatArray:
+        points = scan.points_in_body
+        if scan.point_times is not None and motion is not None and len(points):
+            points = deskew(points, scan.point_times, motion, self._sensor.max_range_m)
+        if self._sensor.is_planar or not len(points):
+            return points
+        return voxel_downsample(points, 0.5 * self._config.voxel_size_m)
+
+    def _predict(self, stamp_s: float) -> tuple[GaussianPose, Pose]:
+        """Return the predicted pose in the last keyframe and the motion since the last scan."""
+        now, before = self._odometry, self._odometry_at_scan
+        if now is not None and before is not None:
+            motion = inverse(before.odom_from_body) @ now.odom_from_body
+            noise_scale = 1.0
+        else:
+            motion = self._last_motion
+            noise_scale = self._motion.constant_velocity_factor
+        if self._sensor.is_planar:
+            motion = project_planar(motion)
+        xi = log(motion)
+        turned, travelled = float(np.linalg.norm(xi[:3])), float(np.linalg.norm(xi[3:]))
+        noise = self._motion
+        sigma_rad = noise_scale * (
+            noise.sigma_floor_rad
+            + noise.sigma_rotation_share * turned
+            + noise.sigma_rotation_rad_per_m * travelled
+        )
+        sigma_m = noise_scale * (noise.sigma_floor_m + noise.sigma_translation_share * travelled)
+        covariance = np.diag([sigma_rad**2] * 3 + [sigma_m**2] * 3)
+        if self._sensor.is_planar:
+            covariance = planar_covariance(covariance)
+        return self._keyframe_from_body @ GaussianPose(motion, covariance), motion
+
+    def _correct(
+        self, scan: Scan, points: FloatArray, predicted: GaussianPose
+    ) -> tuple[GaussianPose, TrackingFailure | None]:
+        """Return the pose in the last keyframe after the scan has been seen."""
+        config = self._config
+        if self._map is None or self._last_stamp_s is None:
+            return predicted, None
+        if self._odometry is None and scan.stamp_s - self._last_stamp_s > config.max_gap_s:
+            return predicted, TrackingFailure.GAP_IN_TIME
+        if len(points) < config.min_points:
+            return predicted, TrackingFailure.TOO_FEW_POINTS
+        source = (
+            points
+            if self._sensor.is_planar
+            else voxel_downsample(points, 1.5 * self._config.voxel_size_m)
+        )
+        pose = self._map.register(
+            source,
+            predicted.mean,
+            max_correspondence_m=config.max_correspondence_m,
+            kernel_m=config.kernel_m,
+        )
+        if pose is None:
+            return predicted, TrackingFailure.TOO_FEW_CORRESPONDENCES
+        correction = log(inverse(predicted.mean) @ pose)
+        if (
+            np.linalg.norm(correction[3:]) > config.max_correction_m
+            or np.linalg.norm(correction[:3]) > config.max_correction_rad
+        ):
+            return predicted, TrackingFailure.CORRECTION_TOO_LARGE
+        match = self._map.match(source, pose, inlier_m=config.max_correspondence_m)
+        if match.inlier_share < config.min_inlier_share:
+            return predicted, TrackingFailure.TOO_FEW_CORRESPONDENCES
+        registered = covariance_of(
+            match.information, sigma_m=self._covariance.sigma_m, is_planar=self._sensor.is_planar
+        )
+        return self._fuse(GaussianPose(pose, registered), predicted), None
+
+    def _fuse(self, registered: GaussianPose, predicted: GaussianPose) -> GaussianPose:
+        """Return the product of registration and motion prior; the scan alone where they disagree.
+
+        The prior fills the directions that the scan does not see. It is not trusted when it
+        contradicts the scan in those that it does (wheel slip).
+        """
+        block = np.ix_(self._axes, self._axes)
+        gap = log(inverse(registered.mean) @ predicted.mean)[self._axes]
+        scan_covariance = registered.covariance[block] + self._floor()[block]
+        prior_covariance = predicted.covariance[block]
+        together = scan_covariance + prior_covariance
+        covariance = np.zeros((6, 6))
+        if gap @ np.linalg.solve(together, gap) > _GATE[len(self._axes)]:
+            step = np.zeros(6)
+            covariance[block] = scan_covariance
+        else:
+            gain = np.linalg.solve(together, scan_covariance).T
+            step = np.zeros(6)
+            step[self._axes] = gain @ gap
+            covariance[block] = symmetric(scan_covariance - gain @ scan_covariance)
+        if self._sensor.is_planar:
+            covariance = planar_covariance(covariance)
+        return GaussianPose(registered.mean @ exp(step), covariance)
+
+    def _floor(self) -> FloatArray:
+        floor = self._covariance
+        return np.diag([floor.floor_rad**2] * 3 + [floor.floor_m**2] * 3)
+
+    def _add_keyframe(
+        self,
+        scan: Scan,
+        points: FloatArray,
+        previous_from_body: GaussianPose,
+        failure: TrackingFailure | None,
+    ) -> Tracking:
+        keyframe = Keyframe(
+            index=self._keyframes,
+            stamp_s=scan.stamp_s,
+            points_in_body=points.astype(np.float32),
+            sensor_in_body=scan.sensor_in_body,
+            previous_from_body=previous_from_body,
+            failure=failure,
+        )
+        if len(points):
+            self._move_window(previous_from_body.mean, points, is_lost=failure is not None)
+            self._keyframes += 1
+            self._keyframe_from_body = certain(identity())
+        self._remember(scan)
+        return Tracking(
+            scan.stamp_s,
+            max(self._keyframes - 1, 0),
+            certain(identity()),
+            keyframe if len(points) else None,
+            failure,
+        )
+
+    def _move_window(self, previous_from_body: Pose, points: FloatArray, *, is_lost: bool) -> None:
+        """Express the window in the new keyframe's frame and index it; a lost scan starts a new one."""
+        body_from_previous = inverse(previous_from_body)
+        kept = [] if is_lost else [(body_from_previous @ pose, cloud) for pose, cloud in self._window]
+        self._window.clear()
+        self._window.extend([*kept, (identity(), points)])
+        self._map = RegistrationMap(
+            np.concatenate([transform_points(pose, cloud) for pose, cloud in self._window]),
+            voxel_m=self._config.voxel_size_m,
+            points_per_voxel=self._config.points_per_voxel,
+            is_planar=self._sensor.is_planar,
+        )
+
+    def _remember(self, scan: Scan) -> None:
+        self._last_stamp_s = scan.stamp_s
+        self._odometry_at_scan = self._odometry

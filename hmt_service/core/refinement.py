@@ -1,0 +1,99 @@
+"""Refinement of a visit that is over: its alignment with its area, and arcs to all that it overlaps.
+
+Nothing topological is decided here: a pair of visits is tied only where the hypothesis' own graph already says, with
+little doubt, that they have seen the same space.
+
+References:
+    Blanco et al. 2008, section V (local maps are fused once the topology is settled).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from hmt_service.core.alignment import Aligner, Mode
+from hmt_service.core.config import Config
+from hmt_service.core.geometry import GaussianPose, transform_points
+from hmt_service.core.graph import Factor
+from hmt_service.core.hypotheses import Hypothesis
+from hmt_service.core.submap import Visit
+
+# chi-square 99.9 % for 6 degrees of freedom: a match beyond it contradicts the graph.
+_GATE = 22.46
+
+
+class Refinement:
+    """Ties a finished visit to the visits that it overlaps."""
+
+    def __init__(self, config: Config, aligner: Aligner) -> None:
+        """Build the stage.
+
+        Args:
+            config: Settings of all stages.
+            aligner: Registers one submap in another.
+        """
+        self._config = config.refinement
+        self._aligner = aligner
+
+    def refine(
+        self, hypothesis: Hypothesis, visit: Visit, visits: Mapping[int, Visit]
+    ) -> Hypothesis:
+        """Return the hypothesis with the arcs that all of the visit's observations support.
+
+        Args:
+            hypothesis: What to refine.
+            visit: The visit that is over.
+            visits: All visits up to and including it.
+        """
+        founder = hypothesis.assignments[visit.visit].area
+        ties: list[tuple[int, Mode]] = []
+        for other in self._neighbours(hypothesis, visit, visits, founder):
+            prior = hypothesis.graph.relative(other, visit.visit)
+            if not self._is_certain(prior):
+                continue
+            mode = self._aligner.refine(visit, visits[other], prior.mean)
+            if mode is not None and self._agrees(prior, mode):
+                ties.append((other, mode))
+        if not ties:
+            return hypothesis
+        graph = hypothesis.graph.copy()
+        assignments = list(hypothesis.assignments)
+        for other, mode in ties:
+            graph.add_factor(Factor(other, visit.visit, mode.target_from_visit))
+            if other == founder:
+                assignments[visit.visit] = replace(
+                    assignments[visit.visit], area_from_visit=mode.target_from_visit
+                )
+        return replace(hypothesis, graph=graph, assignments=tuple(assignments))
+
+    def _neighbours(
+        self, hypothesis: Hypothesis, visit: Visit, visits: Mapping[int, Visit], founder: int
+    ) -> list[int]:
+        """Return the visits near enough to overlap, the founder of the visit's area first."""
+        graph = hypothesis.graph
+        centre = transform_points(graph.pose(visit.visit), visit.centre[None])[0]
+        near = []
+        for other in visits.values():
+            # The visit just before is tied by the motion, from the same observations.
+            if other.visit >= visit.visit - 1:
+                continue
+            there = transform_points(graph.pose(other.visit), other.centre[None])[0]
+            gap = float(np.linalg.norm(there - centre)) - other.radius_m - visit.radius_m
+            if gap <= self._config.max_gap_m:
+                near.append((other.visit != founder, gap, other.visit))
+        return [other for _, _, other in sorted(near)[: self._config.max_neighbours]]
+
+    def _is_certain(self, prior: GaussianPose) -> bool:
+        return (
+            np.sqrt(np.linalg.eigvalsh(prior.covariance[3:, 3:])[-1]) <= self._config.max_sigma_m
+            and np.sqrt(np.linalg.eigvalsh(prior.covariance[:3, :3])[-1])
+            <= self._config.max_sigma_rad
+        )
+
+    @staticmethod
+    def _agrees(prior: GaussianPose, mode: Mode) -> bool:
+        together = prior.covariance + mode.target_from_visit.covariance
+        return GaussianPose(prior.mean, together).mahalanobis2(mode.target_from_visit.mean) <= _GATE

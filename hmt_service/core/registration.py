@@ -1,0 +1,172 @@
+"""Registration of points into a local map: KISS-ICP's parts, with the information that KISS-ICP does not publish.
+
+References:
+    Vizzo et al., KISS-ICP, RA-L 2023, sections III-C to III-E (voxel map, robust point-to-point ICP).
+    Censi, An accurate closed-form estimate of ICP's covariance, ICRA 2007 (information of the match).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from kiss_icp.pybind import kiss_icp_pybind
+from scipy.spatial import KDTree
+
+from hmt_service.core.geometry import (
+    PLANAR_AXES,
+    FloatArray,
+    Pose,
+    project_planar,
+    symmetric,
+    transform_points,
+)
+from hmt_service.core.types import Points
+
+_MAX_ITERATIONS = 100
+_CONVERGENCE = 1e-4
+_NORMAL_NEIGHBOURS = 8
+# A neighbourhood thicker than this share of its width has no surface to speak of.
+_MAX_FLATNESS = 0.25
+_UNBOUNDED_M = 1e9
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Match:
+    """How a cloud fits a map."""
+
+    map_from_points: Pose
+    """Pose of the cloud, shape (4, 4)."""
+    information: FloatArray
+    """Point-to-plane information for unit residual variance (m^2), tangent order, shape (6, 6)."""
+    inlier_share: float
+    """Share of the cloud within the inlier distance of the map, in [0, 1]."""
+
+
+def voxel_downsample(points: FloatArray | Points, voxel_m: float) -> FloatArray:
+    """Return one original point per occupied voxel, shape (M, 3), M <= N."""
+    vectors = kiss_icp_pybind._Vector3dVector(np.asarray(points, dtype=np.float64))
+    return np.asarray(kiss_icp_pybind._voxel_down_sample(vectors, voxel_m))
+
+
+def deskew(points: FloatArray, point_times: FloatArray, motion: Pose, max_range_m: float) -> FloatArray:
+    """Return the points as if all were captured at one time.
+
+    Args:
+        points: Points in the body frame, shape (N, 3), m.
+        point_times: Capture times as a share of the sweep, shape (N,).
+        motion: Motion of the body during one sweep, shape (4, 4).
+        max_range_m: Points beyond are dropped.
+    """
+    preprocessor = kiss_icp_pybind._Preprocessor(max_range_m, 0.0, True, 1)
+    vectors = kiss_icp_pybind._Vector3dVector(points)
+    return np.asarray(preprocessor._preprocess(vectors, point_times.ravel(), motion))
+
+
+class RegistrationMap:
+    """Points to register against: a voxel map for ICP and a KD-tree for what is known of the fit."""
+
+    def __init__(
+        self, points: FloatArray | Points, *, voxel_m: float, points_per_voxel: int, is_planar: bool
+    ) -> None:
+        """Index the points.
+
+        Args:
+            points: Points in the map's frame, shape (N, 3), m, N >= 1.
+            voxel_m: Edge of a voxel.
+            points_per_voxel: Most points kept in one.
+            is_planar: Whether all poses are planar and surfaces vertical.
+        """
+        self._voxels = kiss_icp_pybind._VoxelHashMap(voxel_m, _UNBOUNDED_M, points_per_voxel)
+        self._voxels._add_points(
+            kiss_icp_pybind._Vector3dVector(np.asarray(points, dtype=np.float64))
+        )
+        self._is_planar = is_planar
+        self._registration = kiss_icp_pybind._Registration(_MAX_ITERATIONS, _CONVERGENCE, 1)
+        # The voxel map's own order depends on hashing only, which is the same in every run.
+        self._tree = KDTree(np.asarray(self._voxels._point_cloud()))
+
+    def register(
+        self, points: FloatArray, guess: Pose, *, max_correspondence_m: float, kernel_m: float
+    ) -> Pose | None:
+        """Return the pose of the cloud in the map by robust point-to-point ICP.
+
+        Args:
+            points: Cloud, shape (N, 3), m.
+            guess: Where to start, shape (4, 4).
+            max_correspondence_m: Farthest pair that counts.
+            kernel_m: Scale of the robust kernel.
+
+        Returns:
+            The pose, planar for a planar map; None when the iteration left the numbers.
+        """
+        pose = self._registration._align_points_to_map(
+            points=kiss_icp_pybind._Vector3dVector(points),
+            voxel_map=self._voxels,
+            initial_guess=guess,
+            max_correspondance_distance=max_correspondence_m,
+            kernel=kernel_m,
+        )
+        if not np.all(np.isfinite(pose)):
+            return None
+        return project_planar(pose) if self._is_planar else np.asarray(pose)
+
+    def match(self, points: FloatArray, map_from_points: Pose, *, inlier_m: float) -> Match:
+        """Return what the fit at a pose says about that pose.
+
+        The information is that of point-to-plane residuals against the surface around each matched
+        point: unlike ICP's own point-to-point one it vanishes along a corridor, as it should.
+        """
+        moved = transform_points(map_from_points, points)
+        neighbours = min(_NORMAL_NEIGHBOURS, self._tree.n)
+        distances, indices = self._tree.query(moved, k=neighbours)
+        distances, indices = distances.reshape(len(moved), -1), indices.reshape(len(moved), -1)
+        is_inlier = distances[:, 0] <= inlier_m
+        share = float(np.mean(is_inlier)) if len(moved) else 0.0
+        normals, is_surface = self._normals(indices[is_inlier])
+        normals_in_points = normals @ map_from_points[:3, :3]
+        sources = points[is_inlier]
+        rows = np.hstack([np.cross(sources, normals_in_points), normals_in_points])[is_surface]
+        return Match(map_from_points, symmetric(rows.T @ rows), share)
+
+    def inlier_share(self, points: FloatArray, map_from_points: Pose, *, inlier_m: float) -> float:
+        """Return the share of the cloud within `inlier_m` of the map, in [0, 1]."""
+        if not len(points):
+            return 0.0
+        distances, _ = self._tree.query(
+            transform_points(map_from_points, points), distance_upper_bound=inlier_m
+        )
+        return float(np.mean(np.isfinite(distances)))
+
+    def _normals(self, indices: np.ndarray) -> tuple[FloatArray, np.ndarray]:
+        """Return unit normals, shape (N, 3), and whether there is a surface, shape (N,)."""
+        if not len(indices):
+            return np.zeros((0, 3)), np.zeros(0, dtype=bool)
+        neighbourhoods = np.asarray(self._tree.data)[indices]
+        if self._is_planar:
+            neighbourhoods = neighbourhoods[..., :2]
+        centred = neighbourhoods - neighbourhoods.mean(axis=1, keepdims=True)
+        scatter = np.einsum("nki,nkj->nij", centred, centred)
+        values, vectors = np.linalg.eigh(scatter)
+        normals = np.zeros((len(indices), 3))
+        normals[:, : vectors.shape[1]] = vectors[..., 0]
+        return normals, values[:, 0] <= _MAX_FLATNESS**2 * values[:, 1]
+
+
+def covariance_of(information: FloatArray, *, sigma_m: float, is_planar: bool) -> FloatArray:
+    """Return the covariance of a match, wide where the match says nothing.
+
+    Args:
+        information: Information for unit residual variance, shape (6, 6).
+        sigma_m: Standard deviation of one residual.
+        is_planar: Whether only yaw, x and y are estimated.
+
+    Returns:
+        Covariance, shape (6, 6); 10 m and 10 rad standard deviation along unseen directions.
+    """
+    weak = np.eye(6) * 1e-2
+    result = np.zeros((6, 6))
+    axes = PLANAR_AXES if is_planar else np.arange(6)
+    block = np.ix_(axes, axes)
+    result[block] = np.linalg.inv(information[block] / sigma_m**2 + weak[block])
+    return symmetric(result)

@@ -1,0 +1,143 @@
+"""Submaps: what one visit to an area has seen, in the visit's own frame.
+
+A *visit* is one contiguous stay in an area. Visits are facts, cut from the sequence of observations by the area
+abstraction and shared by all hypotheses; which area a visit was to is what hypotheses disagree about.
+
+References:
+    Blanco et al. 2008, Proposition 1 and Eq. (4) (submaps are independent given the path).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from hmt_service.core.area_abstraction import Cells, cells_of
+from hmt_service.core.config import Config
+from hmt_service.core.geometry import FloatArray, GaussianPose, Pose, certain, identity, transform_points
+from hmt_service.core.registration import RegistrationMap, voxel_downsample
+from hmt_service.core.types import Keyframe, Points
+
+
+@dataclass(frozen=True, eq=False)
+class Visit:
+    """One contiguous stay in an area: a run of keyframes and the submap that they saw.
+
+    Immutable; the visit that the robot is in is replaced by a longer one at each keyframe.
+    """
+
+    visit: int
+    """Identifier, in order of time."""
+    keyframes: tuple[Keyframe, ...]
+    """The keyframes, in time order; the first is the visit's frame."""
+    visit_from_keyframe: tuple[GaussianPose, ...]
+    """Pose of each keyframe in the visit's frame."""
+    cells: tuple[Cells, ...]
+    """Cells that each keyframe saw, in the visit's frame."""
+    config: Config
+    """Settings of all stages."""
+
+    @property
+    def first_keyframe(self) -> int:
+        """Index of the first keyframe."""
+        return self.keyframes[0].index
+
+    @property
+    def last_keyframe(self) -> int:
+        """Index of the last keyframe."""
+        return self.keyframes[-1].index
+
+    @cached_property
+    def points(self) -> FloatArray:
+        """Submap: all points in the visit's frame, one per voxel, shape (N, 3), m."""
+        clouds = [
+            transform_points(pose.mean, keyframe.points_in_body)
+            for pose, keyframe in zip(self.visit_from_keyframe, self.keyframes, strict=True)
+        ]
+        return voxel_downsample(
+            np.concatenate(clouds), 0.5 * self.config.odometry.voxel_size_m
+        )
+
+    def points_in(self, frame_from_visit: Pose) -> FloatArray:
+        """Return the submap in another frame, shape (N, 3), m."""
+        return transform_points(frame_from_visit, self.points)
+
+    @cached_property
+    def registration_map(self) -> RegistrationMap:
+        """The submap, ready to register against."""
+        odometry = self.config.odometry
+        return RegistrationMap(
+            self.points,
+            voxel_m=odometry.voxel_size_m,
+            points_per_voxel=odometry.points_per_voxel,
+            is_planar=self.config.sensor.is_planar,
+        )
+
+    @cached_property
+    def centre(self) -> FloatArray:
+        """Middle of the keyframes' positions in the visit's frame, shape (3,), m."""
+        positions = np.array([pose.mean[:3, 3] for pose in self.visit_from_keyframe])
+        return np.asarray(0.5 * (positions.min(axis=0) + positions.max(axis=0)))
+
+    @cached_property
+    def radius_m(self) -> float:
+        """Distance from the centre within which all keyframes were taken."""
+        positions = np.array([pose.mean[:3, 3] for pose in self.visit_from_keyframe])
+        return float(np.linalg.norm(positions - self.centre, axis=1).max())
+
+    @cached_property
+    def reach_m(self) -> float:
+        """Distance from the centre within which nine in ten of the submap's points lie."""
+        return float(np.quantile(np.linalg.norm(self.points - self.centre, axis=1), 0.9))
+
+    def with_keyframe(self, keyframe: Keyframe) -> Visit:
+        """Return this visit, longer by one keyframe."""
+        pose = self.visit_from_keyframe[-1] @ keyframe.previous_from_body
+        return Visit(
+            self.visit,
+            (*self.keyframes, keyframe),
+            (*self.visit_from_keyframe, pose),
+            (*self.cells, _cells(keyframe, pose.mean, self.config)),
+            self.config,
+        )
+
+    def split(self, first_of_new: int) -> tuple[Visit, Visit, GaussianPose]:
+        """Return the earlier part, the later part as the next visit, and the motion between them.
+
+        Args:
+            first_of_new: Position, in this visit, of the first keyframe of the later part.
+        """
+        earlier = Visit(
+            self.visit,
+            self.keyframes[:first_of_new],
+            self.visit_from_keyframe[:first_of_new],
+            self.cells[:first_of_new],
+            self.config,
+        )
+        later = visit_of(self.visit + 1, self.keyframes[first_of_new:], self.config)
+        last_from_new = self.keyframes[first_of_new].previous_from_body
+        return earlier, later, earlier.visit_from_keyframe[-1] @ last_from_new
+
+
+def visit_of(visit: int, keyframes: Sequence[Keyframe], config: Config) -> Visit:
+    """Return a visit made of these keyframes, in the frame of the first of them."""
+    poses = [certain(identity())]
+    for keyframe in keyframes[1:]:
+        poses.append(poses[-1] @ keyframe.previous_from_body)
+    cells = tuple(
+        _cells(keyframe, pose.mean, config) for keyframe, pose in zip(keyframes, poses, strict=True)
+    )
+    return Visit(visit, tuple(keyframes), tuple(poses), cells, config)
+
+
+def _cells(keyframe: Keyframe, visit_from_keyframe: Pose, config: Config) -> Cells:
+    points = transform_points(visit_from_keyframe, keyframe.points_in_body)
+    return cells_of(points, config.areas.cell_size_m)
+
+
+def as_points(points: FloatArray) -> Points:
+    """Return points in the precision in which they are stored and served, shape (N, 3), m."""
+    return points.astype(np.float32)

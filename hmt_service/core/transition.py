@@ -1,0 +1,164 @@
+"""TSBI: the topological transition model; where can the robot be, now that it has entered an area?
+
+References:
+    Blanco et al. 2008, Eq. (6) first step, section IV-A and Fig. 6.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from hmt_service.core.alignment import Aligner, Mode
+from hmt_service.core.config import Config
+from hmt_service.core.geometry import (
+    PLANAR_AXES,
+    FloatArray,
+    GaussianPose,
+    exp,
+    inverse,
+    log,
+    transform_points,
+)
+from hmt_service.core.graph import Factor
+from hmt_service.core.hypotheses import Hypothesis
+from hmt_service.core.observation import ObservationModel
+from hmt_service.core.submap import Visit
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Successor:
+    """One place that the robot may have entered."""
+
+    area: int | None
+    """A known area, or None for a new one."""
+    area_from_visit: GaussianPose | None
+    """Alignment with that area; None for a new one."""
+    log_factor: float
+    """Log of the probability of entering here times that of the observations, up to a constant."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Candidate:
+    area: int
+    area_from_visit: GaussianPose
+    distance_m: float
+
+
+class Transition:
+    """Expands a hypothesis into everything that the new visit can be."""
+
+    def __init__(
+        self,
+        config: Config,
+        aligner: Aligner,
+        observation: ObservationModel,
+        rng: np.random.Generator,
+    ) -> None:
+        """Build the model.
+
+        Args:
+            config: Settings of all stages.
+            aligner: Finds the modes of a relative pose.
+            observation: Likelihood of scans given a submap.
+            rng: Source of the samples of the prior.
+        """
+        self._config = config.transition
+        self._gate_sigma = config.alignment.gate_sigma
+        self._axes = PLANAR_AXES if config.sensor.is_planar else np.arange(6)
+        self._aligner = aligner
+        self._observation = observation
+        self._rng = rng
+
+    def successors(
+        self, hypothesis: Hypothesis, visit: Visit, arc: Factor, visits: Mapping[int, Visit]
+    ) -> tuple[Successor, ...]:
+        """Return every place that the new visit may be to.
+
+        Args:
+            hypothesis: What is believed of everything before.
+            visit: The new visit, as far as it has been seen.
+            arc: Motion from the visit before to the new one.
+            visits: All closed visits.
+
+        Returns:
+            A new area first, then each mode of each known area.
+        """
+        candidates = self._candidates(hypothesis, visit, arc, visits)
+        outside = self._mass_outside(candidates, visit, visits)
+        result = [Successor(None, None, float(np.log(outside)))]
+        for candidate in candidates:
+            target = visits[candidate.area]
+            for mode in self._aligner.modes(visit, target, candidate.area_from_visit):
+                log_factor = self._log_factor(visit, target, candidate.area_from_visit, mode)
+                result.append(Successor(candidate.area, mode.target_from_visit, log_factor))
+        return tuple(result)
+
+    def _candidates(
+        self, hypothesis: Hypothesis, visit: Visit, arc: Factor, visits: Mapping[int, Visit]
+    ) -> list[_Candidate]:
+        """Return the areas whose extent the prior reaches, the nearest first."""
+        result = []
+        for area in hypothesis.areas:
+            if area == hypothesis.current.area:
+                continue
+            target = visits[area]
+            prior = hypothesis.graph.relative(area, arc.visit_a) @ arc.a_from_b
+            offset = transform_points(prior.mean, visit.centre[None])[0] - target.centre
+            sigma_m = float(np.sqrt(np.linalg.eigvalsh(prior.covariance[3:, 3:])[-1]))
+            margin = self._config.margin_share * target.reach_m
+            distance = float(np.linalg.norm(offset)) - target.radius_m - visit.radius_m - margin
+            if distance <= self._gate_sigma * sigma_m:
+                result.append(_Candidate(area, prior, distance))
+        result.sort(key=lambda candidate: (candidate.distance_m, candidate.area))
+        return result[: self._config.max_candidates]
+
+    def _mass_outside(
+        self, candidates: list[_Candidate], visit: Visit, visits: Mapping[int, Visit]
+    ) -> float:
+        """Return the prior probability that the robot is in no known area, never quite 0 or 1."""
+        samples = self._config.prior_samples
+        body_in_visit = visit.visit_from_keyframe[-1].mean[:3, 3]
+        inside = 0.0
+        for candidate in candidates:
+            prior = candidate.area_from_visit
+            noise = self._rng.multivariate_normal(
+                np.zeros(6), prior.covariance, size=samples, method="cholesky"
+            )
+            positions = (prior.mean @ exp(noise))[:, :3, :3] @ body_in_visit
+            positions += (prior.mean @ exp(noise))[:, :3, 3]
+            known = np.array([p.mean[:3, 3] for p in visits[candidate.area].visit_from_keyframe])
+            distances = np.linalg.norm(positions[:, None] - known[None], axis=2).min(axis=1)
+            inside += float(np.mean(distances <= self._config.presence_m))
+        return float(np.clip(1.0 - inside, 1.0 / (samples + 1), samples / (samples + 1)))
+
+    def _log_factor(self, visit: Visit, target: Visit, prior: GaussianPose, mode: Mode) -> float:
+        """Return the log of the Laplace integral of prior times likelihood around one mode."""
+        pose = mode.target_from_visit
+        log_ratio = self._observation.log_ratio_of_all(
+            (
+                (keyframe, pose.mean @ visit_from_keyframe.mean)
+                for keyframe, visit_from_keyframe in zip(
+                    visit.keyframes, visit.visit_from_keyframe, strict=True
+                )
+            ),
+            target.points,
+        )
+        return log_ratio + self._log_prior(prior, pose)
+
+    def _log_prior(self, prior: GaussianPose, pose: GaussianPose) -> float:
+        """Return log of N(x*; prior) times the volume of the mode.
+
+        With a likelihood peak of shape N(x; x*, S), the integral over the prior N(x; m, P) is
+        sqrt(|S| / |P + S|) exp(-1/2 (x* - m)' (P + S)^-1 (x* - m)) times its height.
+        """
+        block = np.ix_(self._axes, self._axes)
+        together: FloatArray = prior.covariance[block] + pose.covariance[block]
+        gap = log(inverse(prior.mean) @ pose.mean)[self._axes]
+        _, log_volume = np.linalg.slogdet(pose.covariance[block])
+        _, log_prior_volume = np.linalg.slogdet(together)
+        return float(
+            0.5 * (log_volume - log_prior_volume) - 0.5 * gap @ np.linalg.solve(together, gap)
+        )
