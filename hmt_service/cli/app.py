@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from hmt_service import __version__
-from hmt_service.cli import evaluate
+from hmt_service.cli import control, evaluate, query, replay, serve
 
 app = typer.Typer(
     name="hmt",
@@ -39,4 +39,13 @@ def _options(
     """Hybrid metric-topological SLAM."""
 
 
+app.command("serve")(serve.serve)
+app.command("replay")(replay.replay)
+app.command("status")(query.status)
+app.command("pose")(query.pose)
+app.command("posterior")(query.posterior)
+app.command("areas")(query.areas)
+app.command("map")(query.map_)
+app.command("compare")(query.compare)
+app.add_typer(control.app, name="ctl")
 app.command("eval")(evaluate.evaluate)

@@ -52,7 +52,10 @@ class Stop:
 
 @dataclass(frozen=True, slots=True)
 class Finish:
-    """No reading will follow; travels behind the last one through every process."""
+    """Complete and save the map; travels behind the readings so far through every process."""
+
+    number: int
+    """Grows with every one."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,7 +84,7 @@ class RunReport:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mapped:
-    """The topology has processed one scan, or the end of the data."""
+    """The topology has processed one scan, or a `Finish`."""
 
     snapshot: Snapshot | None
     """What readers may know now; None when nothing changed."""
@@ -95,8 +98,10 @@ class Mapped:
 
 @dataclass(frozen=True, slots=True)
 class Finished:
-    """The last area is closed and the map is saved."""
+    """The map is complete and saved."""
 
+    number: int
+    """Of the `Finish` that it answers."""
     files: tuple[str, ...]
     """Names of the files written."""
     failure: str | None = None

@@ -60,7 +60,7 @@ class Listener(Protocol):
         """Take what the odometry says of the latest scan."""
 
     def on_map(self, mapped: Mapped) -> None:
-        """Take what the topology made of one scan, or of the end of the data."""
+        """Take what the topology made of one scan, or of a `Finish`."""
 
 
 @dataclass(slots=True)
@@ -159,17 +159,17 @@ class Pipeline:
         """Hand over the next reading, waiting for room; return False when the odometry is gone."""
         return self._odometry.put(dump(reading))
 
-    def finish(self) -> bool:
-        """Say that no reading follows; `on_map` gets the outcome.
+    def finish(self, finish: Finish) -> bool:
+        """Complete and save the map behind the readings so far; `on_map` gets the outcome.
 
         Returns:
             False when the odometry is gone.
         """
-        return self._odometry.put_token(Finish())
+        return self._odometry.put_token(finish)
 
-    def finish_map(self) -> bool:
-        """Finish with the scans that the topology has been handed; return False when it is gone."""
-        return self._topology.put_token(Finish())
+    def finish_map(self, finish: Finish) -> bool:
+        """Complete and save the map with the scans that the topology has; False when it is gone."""
+        return self._topology.put_token(finish)
 
     def request(
         self, request: Request, on_result: Callable[[Result], None], *, timeout_s: float

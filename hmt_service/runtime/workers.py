@@ -66,7 +66,7 @@ def run_topology(
         if connection is requests:
             _send(requests, topology.answer(message))
         elif isinstance(message, Finish):
-            _send(work, topology.finish())
+            _send(work, topology.finish(message))
         else:
             _send(work, topology.map(message))
 
@@ -82,7 +82,6 @@ class _Topology:
         self._scans = 0
         self._odometry_busy_s = 0.0
         self._busy_s = 0.0
-        self._is_finished = False
 
     def map(self, tracked: Tracked) -> Mapped:
         """Take one scan into the map."""
@@ -95,14 +94,16 @@ class _Topology:
         has_changed = tracked.tracking.keyframe is not None or bool(events)
         return Mapped(self._engine.snapshot() if has_changed else None, events, self._report())
 
-    def finish(self) -> Mapped:
-        """Close the map and save it."""
+    def finish(self, finish: Finish) -> Mapped:
+        """Complete the map and save it."""
         started = time.perf_counter()
-        events = () if self._is_finished else self._engine.finish()
-        self._is_finished = True
+        events = self._engine.finish()
         self._busy_s += time.perf_counter() - started
         saved = () if self._save is None else self._saved(self._save)
-        finished = Finished((), str(saved)) if isinstance(saved, HmtError) else Finished(saved)
+        if isinstance(saved, HmtError):
+            finished = Finished(finish.number, (), str(saved))
+        else:
+            finished = Finished(finish.number, saved)
         return Mapped(self._engine.snapshot(), events, self._report(), finished)
 
     def answer(self, request: Request) -> Result:

@@ -41,7 +41,8 @@ from hmt_service.runtime.messages import ProcessName, ProcessStatus
 from hmt_service.service.reports import Ack, DaemonState, InputCounts, Status
 from hmt_service.service.v1 import hmt_pb2 as pb
 
-_PREFIX = "application/protobuf;"
+PREFIX = "application/protobuf;"
+"""Begins the encoding of every payload."""
 _FAILURES: dict[str, type[HmtError]] = {
     error.code: error
     for error in (InvalidInput, NotFound, Unavailable, DeadlineExceeded, DaemonFailure)
@@ -67,7 +68,7 @@ def wire(message: Message) -> Wire:
 
 def encoding_of(message: type[Message]) -> str:
     """Return the encoding that payloads of this message travel with."""
-    return _PREFIX + message.DESCRIPTOR.full_name
+    return PREFIX + message.DESCRIPTOR.full_name
 
 
 Value = HmtPose | Posterior | GlobalMap | Comparison | Event | tuple[Event, ...] | Status | Ack

@@ -153,7 +153,7 @@ def _finish(gateway: Gateway, pipeline: Pipeline, *, is_broken: bool) -> Finishe
         if not is_bypassed and (is_broken or not pipeline.is_alive(ProcessName.ODOMETRY)):
             # Nothing comes through the odometry any more: finish with what the topology has.
             gateway.discard()
-            pipeline.finish_map()
+            gateway.finish_map()
             is_bypassed = True
         if elapsed_s > _DRAIN_S:
             gateway.discard()

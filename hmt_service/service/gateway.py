@@ -25,6 +25,7 @@ from hmt_service.errors import DaemonFailure, HmtError, Unavailable
 from hmt_service.runtime.localization import Localizer
 from hmt_service.runtime.messages import (
     CompareRequest,
+    Finish,
     Finished,
     Mapped,
     MapRequest,
@@ -84,10 +85,9 @@ class Gateway:
         self._report = RunReport(0, 0.0, 0.0)
         self._events: deque[Event] = deque(maxlen=_KEPT_EVENTS)
         self._lock = threading.Lock()
-        self._is_finishing = False
         self._is_stopping = False
-        self._finished: Finished | None = None
-        self._on_finished: list[Callable[[Finished], None]] = []
+        self._finishes = 0
+        self._on_finished: dict[int, Callable[[Finished], None]] = {}
         self._started_s = time.monotonic()
         self._reported: Counter[str] = Counter()
         self._reported_s = self._started_s
@@ -116,10 +116,9 @@ class Gateway:
 
     def close(self) -> None:
         """Take everything back; calls that still wait get an error."""
-        with self._lock:
-            waiting, self._on_finished = self._on_finished, []
-        for on_finished in waiting:
-            on_finished(Finished((), "the daemon stopped before it had finished"))
+        self._intake.stop()
+        reason = "the daemon stopped before the map was saved"
+        self._finish_until(Finished(self._finishes, (), reason))
         self._token.undeclare()
         for queryable in self._queryables:
             queryable.undeclare()
@@ -145,20 +144,19 @@ class Gateway:
             self._report_refused()
 
     def finish(self, on_finished: Callable[[Finished], None]) -> None:
-        """Take no more input, process what has arrived, close and save the map.
+        """Process what has arrived, complete the map and save it; input may follow.
 
         Args:
             on_finished: Called once with the outcome, from any thread.
         """
         with self._lock:
-            finished = self._finished
-            if finished is None:
-                self._on_finished.append(on_finished)
-            is_first, self._is_finishing = not self._is_finishing, True
-        if finished is not None:
-            on_finished(finished)
-        elif is_first:
-            self._intake.finish()
+            self._finishes += 1
+            self._on_finished[self._finishes] = on_finished
+            self._intake.finish(Finish(self._finishes))
+
+    def finish_map(self) -> None:
+        """Do the same with the scans that the topology has: nothing comes through the odometry."""
+        self._pipeline.finish_map(Finish(self._finishes))
 
     def discard(self) -> None:
         """Throw away what waits to be decoded."""
@@ -205,17 +203,19 @@ class Gateway:
             self._put(Topic.POSTERIOR, mapped.snapshot.posterior)
         self.publish(mapped.events)
         if mapped.finished is not None:
-            with self._lock:
-                self._finished = mapped.finished
-                waiting, self._on_finished = self._on_finished, []
-            for on_finished in waiting:
-                on_finished(mapped.finished)
+            self._finish_until(mapped.finished)
+
+    def _finish_until(self, finished: Finished) -> None:
+        # Earlier ones too: their tokens are lost when the odometry is.
+        with self._lock:
+            numbers = [number for number in self._on_finished if number <= finished.number]
+            waiting = [self._on_finished.pop(number) for number in numbers]
+        for on_finished in waiting:
+            on_finished(finished)
 
     def _state(self) -> DaemonState:
         if self._is_stopping:
             return DaemonState.STOPPING
-        if self._finished is not None:
-            return DaemonState.FINISHED
         return DaemonState.RUNNING if self._pipeline.is_ready else DaemonState.STARTING
 
     def _put(self, topic: Topic, value: Value) -> None:

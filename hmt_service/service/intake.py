@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 from hmt_service.core.config import SensorConfig
 from hmt_service.core.types import Reading
+from hmt_service.runtime.messages import Finish
 from hmt_service.runtime.ordering import ReorderWindow
 from hmt_service.runtime.queues import SizedQueue
 from hmt_service.service.keys import Input
@@ -41,8 +42,8 @@ class _Sample:
     encoding: str
 
 
-class _End:
-    """Marks the place in the queue behind which nothing follows."""
+class _Stop:
+    """Marks the end of the queue."""
 
 
 class Intake:
@@ -54,7 +55,7 @@ class Intake:
         limits: IntakeLimits,
         *,
         submit: Callable[[Reading], bool],
-        finish: Callable[[], bool],
+        finish: Callable[[Finish], bool],
     ) -> None:
         """Prepare; `start` starts.
 
@@ -62,17 +63,17 @@ class Intake:
             sensor: What the sensor can see.
             limits: What may wait here.
             submit: Takes the readings in order, and may block.
-            finish: Called once, behind the last reading.
+            finish: Takes the `Finish` behind the readings that came before it.
         """
         self._sensor = sensor
         self._limits = limits
         self._submit = submit
         self._finish = finish
-        self._queue: SizedQueue[_Sample | _End] = SizedQueue(limits.queue_bytes)
+        self._queue: SizedQueue[_Sample | Finish | _Stop] = SizedQueue(limits.queue_bytes)
         self._window = ReorderWindow(limits.reorder_s)
         self._thread = threading.Thread(target=self._pump, name="intake", daemon=True)
         self._lock = threading.Lock()
-        self._is_finished = False
+        self._is_stopped = False
         self._received = 0
         self._accepted = 0
         self._discarded = 0
@@ -85,8 +86,8 @@ class Intake:
 
     @property
     def is_broken(self) -> bool:
-        """Whether the thread here has ended although nobody said `finish`."""
-        return not self._thread.is_alive() and not self._is_finished
+        """Whether the thread here has ended although nobody said `stop`."""
+        return not self._thread.is_alive() and not self._is_stopped
 
     @property
     def last_stamp_s(self) -> float:
@@ -107,17 +108,20 @@ class Intake:
                 self._refused[Refusal.UNKNOWN_KEY] += 1
             elif size > self._limits.sample_bytes:
                 self._refused[Refusal.TOO_LARGE] += 1
-            elif self._is_finished:
-                self._refused[Refusal.FINISHED] += 1
+            elif self._is_stopped:
+                self._refused[Refusal.STOPPING] += 1
             elif not self._queue.offer(_Sample(name, *read()), size):
                 self._refused[Refusal.QUEUE_FULL] += 1
 
-    def finish(self) -> None:
+    def finish(self, finish: Finish) -> None:
+        """Hand on what has arrived without waiting for earlier readings, and `finish` behind it."""
+        self._queue.put_token(finish)
+
+    def stop(self) -> None:
         """Take nothing more; what has arrived is still handed on."""
         with self._lock:
-            self._is_finished = True
-            self._queue.put_token(_End())
-            self._queue.close()
+            self._is_stopped = True
+            self._queue.put_token(_Stop())
 
     def discard(self) -> None:
         """Throw away what waits to be decoded."""
@@ -142,15 +146,12 @@ class Intake:
     def _pump(self) -> None:
         while True:
             item = self._queue.get(self._limits.silence_s)
-            match item:
-                case _Sample():
-                    released = self._take(item)
-                case _:
-                    released = self._window.flush()
+            released = self._take(item) if isinstance(item, _Sample) else self._window.flush()
             for reading in released:
                 self._submit(reading)
-            if isinstance(item, _End):
-                self._finish()
+            if isinstance(item, Finish):
+                self._finish(item)
+            elif isinstance(item, _Stop):
                 return
 
     def _take(self, sample: _Sample) -> tuple[Reading, ...]:

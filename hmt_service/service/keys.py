@@ -22,6 +22,9 @@ from enum import StrEnum
 
 from hmt_service.errors import InvalidInput
 
+DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+"""Where a daemon listens, and clients look for it, unless told otherwise."""
+
 _NAME = re.compile(r"[A-Za-z0-9_.-]{1,64}")
 
 

@@ -73,7 +73,7 @@ class Refusal(StrEnum):
 
     TOO_LARGE = "too_large"
     QUEUE_FULL = "queue_full"
-    FINISHED = "finished"
+    STOPPING = "stopping"
     UNKNOWN_KEY = "unknown_key"
     WRONG_ENCODING = "wrong_encoding"
     NOT_PROTOBUF = "not_protobuf"

@@ -20,8 +20,6 @@ class DaemonState(StrEnum):
     """Processes are loading; input is already queued."""
     RUNNING = "running"
     """Input is taken, queries are answered."""
-    FINISHED = "finished"
-    """No more input; all queries are answered."""
     STOPPING = "stopping"
     """No more input; the map is being saved."""
 

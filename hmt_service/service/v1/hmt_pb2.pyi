@@ -29,7 +29,6 @@ class DaemonState(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     DAEMON_STATE_UNSPECIFIED: _ClassVar[DaemonState]
     DAEMON_STATE_STARTING: _ClassVar[DaemonState]
     DAEMON_STATE_RUNNING: _ClassVar[DaemonState]
-    DAEMON_STATE_FINISHED: _ClassVar[DaemonState]
     DAEMON_STATE_STOPPING: _ClassVar[DaemonState]
 
 class ErrorCode(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
@@ -54,7 +53,6 @@ EVENT_KIND_PROCESS_FAILED: EventKind
 DAEMON_STATE_UNSPECIFIED: DaemonState
 DAEMON_STATE_STARTING: DaemonState
 DAEMON_STATE_RUNNING: DaemonState
-DAEMON_STATE_FINISHED: DaemonState
 DAEMON_STATE_STOPPING: DaemonState
 ERROR_CODE_UNSPECIFIED: ErrorCode
 ERROR_CODE_INVALID_ARGUMENT: ErrorCode

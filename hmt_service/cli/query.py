@@ -1,0 +1,308 @@
+"""`hmt status`, `pose`, `posterior`, `areas`, `map`, `compare`: ask a daemon.
+
+References: own.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import numpy as np
+import typer
+
+from hmt_service.cli.connection import Connect, Json, Robot, Site, Timeout
+from hmt_service.core.geometry import GaussianPose, yaw_of
+from hmt_service.core.types import MapMethod
+from hmt_service.service.keys import DEFAULT_ENDPOINT
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from hmt_service.core.types import GlobalMap
+    from hmt_service.service.client import HmtClient
+    from hmt_service.service.reports import Status
+
+Reference = Annotated[int | None, typer.Option(min=0, help="Area whose frame the map is in.")]
+Hypothesis = Annotated[
+    int | None, typer.Option(min=0, help="Hypothesis; the most probable one if not given.")
+]
+
+
+def status(
+    connect: Connect = DEFAULT_ENDPOINT,
+    site: Site = "site",
+    robot: Robot = "robot",
+    timeout: Timeout = 10.0,
+    as_json: Json = False,
+) -> None:
+    """Show what the daemon has received, refused and processed."""
+    with _client(connect, site, robot, timeout) as client:
+        answer = client.status()
+    if not _print_json(answer, is_wanted=as_json):
+        _print(_pairs(f"{site}/{robot}", _status_rows(answer)))
+
+
+def pose(
+    connect: Connect = DEFAULT_ENDPOINT,
+    site: Site = "site",
+    robot: Robot = "robot",
+    timeout: Timeout = 10.0,
+    as_json: Json = False,
+) -> None:
+    """Show where the robot is, and how sure that is."""
+    with _client(connect, site, robot, timeout) as client:
+        answer = client.pose()
+    if _print_json(answer, is_wanted=as_json):
+        return
+    rows = {
+        "stamp": f"{answer.stamp_s:.3f} s",
+        "area": f"{answer.area}, probability {answer.probability:.3f}",
+        "pose in the area": _pose(answer.area_from_body),
+        f"pose in the frame of area {answer.reference_area}": _pose(answer.reference_from_body),
+        "hypothesis": f"{answer.hypothesis}, revision {answer.revision}",
+    }
+    _print(_pairs("pose", rows))
+
+
+def posterior(
+    connect: Connect = DEFAULT_ENDPOINT,
+    site: Site = "site",
+    robot: Robot = "robot",
+    timeout: Timeout = 10.0,
+    as_json: Json = False,
+) -> None:
+    """Show the topologies that the robot may have travelled, with their probabilities."""
+    with _client(connect, site, robot, timeout) as client:
+        answer = client.posterior()
+    if _print_json(answer, is_wanted=as_json):
+        return
+    ess = answer.effective_sample_size
+    _print(
+        _table(
+            f"revision {answer.revision}, effective sample size {ess:.1f}",
+            ("hypothesis", "probability", "areas", "loop closures", "current area", "path"),
+            (
+                (
+                    summary.hypothesis,
+                    f"{summary.probability:.4f}",
+                    summary.areas,
+                    summary.loop_closures,
+                    summary.current_area,
+                    _path(summary.topological_path),
+                )
+                for summary in answer.hypotheses
+            ),
+        )
+    )
+
+
+def areas(
+    connect: Connect = DEFAULT_ENDPOINT,
+    site: Site = "site",
+    robot: Robot = "robot",
+    timeout: Timeout = 10.0,
+    reference: Reference = None,
+    hypothesis: Hypothesis = None,
+    as_json: Json = False,
+) -> None:
+    """Show all areas: where they are, how often they were visited, what they border on."""
+    with _client(connect, site, robot, timeout) as client:
+        answer = client.areas(reference=reference, hypothesis=hypothesis)
+    if not _print_json(answer, is_wanted=as_json):
+        _print(_areas_table(answer))
+
+
+def map_(
+    connect: Connect = DEFAULT_ENDPOINT,
+    site: Site = "site",
+    robot: Robot = "robot",
+    timeout: Timeout = 10.0,
+    method: Annotated[
+        MapMethod | None,
+        typer.Option(
+            help="How areas are brought into one frame; a figure shows both if not given."
+        ),
+    ] = None,
+    reference: Reference = None,
+    hypothesis: Hypothesis = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Figure to draw, such as map.png; without it, a table.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Show a global map, as a table or as a figure."""
+    with _client(connect, site, robot, timeout) as client:
+        if out is not None:
+            _draw(client, out, method, reference, hypothesis)
+            return
+        answer = client.map(
+            method or MapMethod.CONSISTENT,
+            reference=reference,
+            hypothesis=hypothesis,
+            with_points=False,
+        )
+    if not _print_json(answer, is_wanted=as_json):
+        _print(_areas_table(answer))
+
+
+def compare(
+    connect: Connect = DEFAULT_ENDPOINT,
+    site: Site = "site",
+    robot: Robot = "robot",
+    timeout: Timeout = 10.0,
+    reference: Reference = None,
+    hypothesis: Hypothesis = None,
+    as_json: Json = False,
+) -> None:
+    """Show how far the shortest-path map is from the consistent one, area by area."""
+    with _client(connect, site, robot, timeout) as client:
+        answer = client.compare(reference=reference, hypothesis=hypothesis)
+    if _print_json(answer, is_wanted=as_json):
+        return
+    title = f"frame of area {answer.reference_area}, hypothesis {answer.hypothesis}"
+    _print(
+        _table(
+            f"{title}: shortest paths against consistent",
+            ("area", "distance m", "angle deg", "σ consistent m", "σ shortest path m"),
+            (
+                (
+                    area.area,
+                    f"{area.translation_m:.3f}",
+                    f"{math.degrees(area.rotation_rad):.2f}",
+                    f"{area.sigma_consistent_m:.3f}",
+                    f"{area.sigma_shortest_path_m:.3f}",
+                )
+                for area in answer.areas
+            ),
+        ),
+        _table(
+            "contradiction between arc and areas",
+            ("arc", "consistent m", "shortest path m"),
+            (
+                (
+                    f"{arc.area_a} – {arc.area_b}",
+                    f"{arc.consistent_m:.3f}",
+                    f"{arc.shortest_path_m:.3f}",
+                )
+                for arc in answer.arcs
+            ),
+        ),
+    )
+
+
+def _client(connect: str, site: str, robot: str, timeout_s: float) -> HmtClient:
+    from hmt_service.service.client import HmtClient
+
+    return HmtClient(connect, site=site, robot=robot, timeout_s=timeout_s)
+
+
+def _draw(
+    client: HmtClient,
+    path: Path,
+    method: MapMethod | None,
+    reference: int | None,
+    hypothesis: int | None,
+) -> None:
+    from hmt_service.viz.figures import draw_maps
+
+    methods = [method] if method is not None else list(MapMethod)
+    maps = [client.map(m, reference=reference, hypothesis=hypothesis) for m in methods]
+    comparison = client.compare(reference=reference, hypothesis=hypothesis)
+    draw_maps(maps, comparison, path)
+
+
+def _status_rows(answer: Status) -> dict[str, str]:
+    counts = answer.input
+    rows = {
+        "state": f"{answer.state}, version {answer.version}, up {answer.uptime_s:.0f} s",
+        "received": f"{counts.received} samples",
+        "accepted": f"{counts.accepted} readings, {counts.reordering} being ordered",
+        "refused": _counted(counts.refused),
+        "waiting": f"{counts.queued} samples, {counts.queued_bytes / 1e6:.1f} MB",
+        "dropped beams": _counted(counts.dropped_beams),
+        "scans": f"{answer.tracked_scans} tracked, {answer.processed_scans} in the map",
+        "map": f"revision {answer.revision}: {answer.areas} areas, {answer.arcs} arcs, "
+        f"{answer.keyframes} keyframes, {answer.hypotheses} hypotheses",
+    }
+    for process in answer.processes:
+        readiness = "ready" if process.is_ready else "loading"
+        rows[process.name] = (
+            f"pid {process.pid}, {readiness}, {process.processed} processed in "
+            f"{process.busy_s:.1f} s, {process.backlog} waiting"
+        )
+    return rows
+
+
+def _areas_table(answer: GlobalMap) -> Table:
+    neighbours: dict[int, list[int]] = {area.area: [] for area in answer.areas}
+    for arc in answer.arcs:
+        neighbours[arc.area_a].append(arc.area_b)
+        neighbours[arc.area_b].append(arc.area_a)
+    return _table(
+        f"{answer.method} map in the frame of area {answer.reference_area}, hypothesis "
+        f"{answer.hypothesis} (probability {answer.probability:.3f}), revision {answer.revision}",
+        ("area", "pose", "keyframes", "visits", "neighbours"),
+        (
+            (
+                area.area,
+                _pose(area.reference_from_area),
+                area.keyframes,
+                area.visits,
+                " ".join(map(str, sorted(neighbours[area.area]))),
+            )
+            for area in answer.areas
+        ),
+    )
+
+
+def _pose(gaussian: GaussianPose) -> str:
+    """Return position and heading with their standard deviations."""
+    x, y, z = gaussian.mean[:3, 3]
+    # Tangent order [rotation, translation]; the largest axis of the position's ellipsoid.
+    sigma_m = math.sqrt(max(0.0, float(np.linalg.eigvalsh(gaussian.covariance[3:, 3:])[-1])))
+    sigma_deg = math.degrees(math.sqrt(max(0.0, gaussian.covariance[2, 2])))
+    yaw_deg = math.degrees(yaw_of(gaussian.mean))
+    return f"({x:.3f}, {y:.3f}, {z:.3f}) ±{sigma_m:.3f} m, {yaw_deg:.2f} ±{sigma_deg:.2f} deg"
+
+
+def _path(areas: tuple[int, ...], *, shown: int = 12) -> str:
+    latest = " ".join(map(str, areas[-shown:]))
+    return latest if len(areas) <= shown else f"… {latest}"
+
+
+def _counted(counts: Mapping[str, int]) -> str:
+    return ", ".join(f"{count} {reason}" for reason, count in sorted(counts.items())) or "none"
+
+
+def _print_json(value: object, *, is_wanted: bool) -> bool:
+    if is_wanted:
+        from hmt_service.cli.plain import to_json
+
+        typer.echo(to_json(value))
+    return is_wanted
+
+
+def _pairs(title: str, rows: Mapping[str, str]) -> Table:
+    return _table(title, ("", ""), rows.items())
+
+
+def _table(title: str, headings: Iterable[str], rows: Iterable[Iterable[object]]) -> Table:
+    from rich.table import Table
+
+    table = Table(title=title, title_justify="left", show_header=any(headings))
+    for heading in headings:
+        table.add_column(heading)
+    for row in rows:
+        table.add_row(*map(str, row))
+    return table
+
+
+def _print(*tables: Table) -> None:
+    from rich.console import Console
+
+    console = Console()
+    for table in tables:
+        console.print(table)

@@ -1,0 +1,111 @@
+"""`hmt replay`: send a recorded log to a daemon.
+
+References: own.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from hmt_service.cli.connection import Connect, Robot, Site
+from hmt_service.errors import DaemonFailure
+from hmt_service.service.keys import DEFAULT_ENDPOINT
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from hmt_service.core.types import Reading
+    from hmt_service.service.client import HmtClient
+    from hmt_service.service.reports import Status
+
+_FARTHEST_M = 1e6
+"""Everything finite is sent: what is a return is the daemon's settings' business."""
+_CHECK_EVERY = 200
+_POLL_S = 0.1
+_MOST_QUEUED_BYTES = 64_000_000
+"""The sender waits while more than this waits at the daemon, which drops what it cannot hold."""
+
+
+def replay(
+    log: Annotated[Path, typer.Argument(help="Recorded log.")],
+    connect: Connect = DEFAULT_ENDPOINT,
+    site: Site = "site",
+    robot: Robot = "robot",
+    rate: Annotated[
+        float | None,
+        typer.Option(min=1e-3, help="Speed in multiples of real time; without it, full speed."),
+    ] = None,
+    finish: Annotated[
+        bool, typer.Option(help="Wait until all is in the map, and have it completed and saved.")
+    ] = True,
+) -> None:
+    """Send a recorded log to a daemon, and wait for the map."""
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from hmt_service.core.types import Scan
+    from hmt_service.io.logs import read_log
+    from hmt_service.service.client import HmtClient
+
+    console = Console(stderr=True)
+    with HmtClient(connect, site=site, robot=robot) as client:
+        before = client.status()
+        with console.status(f"reading {log}"):
+            readings = read_log(log, min_range_m=0.0, max_range_m=_FARTHEST_M).readings
+        scans = sum(isinstance(reading, Scan) for reading in readings)
+        with Progress(console=console) as progress:
+            sending = progress.add_task("sending", total=len(readings))
+            for sent, reading in enumerate(_paced(readings, rate)):
+                if sent % _CHECK_EVERY == 0:
+                    _wait_for_room(client)
+                client.publish(reading)
+                progress.advance(sending)
+            if finish:
+                mapping = progress.add_task("mapping", total=scans)
+                known = before.processed_scans
+                _finish(client, lambda n: progress.update(mapping, completed=n - known))
+        after = client.status()
+    _report(console, len(readings), before, after)
+
+
+def _paced(readings: Sequence[Reading], rate: float | None) -> Iterator[Reading]:
+    """Yield readings when their time has come, at `rate` times real time; at once without it."""
+    if rate is None:
+        yield from readings
+        return
+    started_s = time.monotonic()
+    for reading in readings:
+        due_s = started_s + (reading.stamp_s - readings[0].stamp_s) / rate
+        time.sleep(max(0.0, due_s - time.monotonic()))
+        yield reading
+
+
+def _wait_for_room(client: HmtClient) -> None:
+    while client.status().input.queued_bytes > _MOST_QUEUED_BYTES:
+        time.sleep(_POLL_S)
+
+
+def _finish(client: HmtClient, show: Callable[[int], None]) -> None:
+    """Have the map completed, and show the number of scans in it meanwhile."""
+    with ThreadPoolExecutor(max_workers=1) as pool:
+        ack = pool.submit(client.finish)
+        while not wait([ack], timeout=_POLL_S).done:
+            show(client.status().processed_scans)
+        show(ack.result().processed_scans)
+
+
+def _report(console: Console, sent: int, before: Status, after: Status) -> None:
+    received = after.input.received - before.input.received
+    if received < sent:
+        raise DaemonFailure(f"{sent - received} of {sent} readings did not reach the daemon")
+    new = Counter(after.input.refused) - Counter(before.input.refused)
+    refused = ", ".join(f"{count} {reason}" for reason, count in new.items()) or "none"
+    scans = after.processed_scans - before.processed_scans
+    console.print(f"{sent} readings sent, refused {refused}; {scans} scans new in the map")

@@ -1,0 +1,122 @@
+"""`hmt serve`: the daemon.
+
+References: own.
+"""
+
+from __future__ import annotations
+
+import logging
+import signal
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from hmt_service.cli.connection import Robot, Site
+from hmt_service.core.config import Preset
+from hmt_service.errors import NotFound
+from hmt_service.service.keys import DEFAULT_ENDPOINT, Keys
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from hmt_service.service.daemon import StopReport
+
+PROCESS_FAILED = 3
+"""Exit code after a process of the daemon has died."""
+NOT_SAVED = 4
+"""Exit code when there was a map and it could not be saved."""
+
+
+def serve(
+    site: Site = "site",
+    robot: Robot = "robot",
+    listen: Annotated[
+        list[str] | None,
+        typer.Option(help=f"Zenoh endpoint to listen on; {DEFAULT_ENDPOINT} if none is given."),
+    ] = None,
+    connect: Annotated[
+        list[str] | None, typer.Option(help="Zenoh endpoint to connect to, such as a router's.")
+    ] = None,
+    scouting: Annotated[
+        bool, typer.Option("--scouting", help="Look for others on the network by multicast.")
+    ] = False,
+    preset: Annotated[Preset, typer.Option(help="Kind of sensor.")] = Preset.PLANAR,
+    config: Annotated[
+        Path | None, typer.Option(help="YAML file of settings that differ from the preset.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of all randomness.")] = 0,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder to save the map to; without it nothing is saved.")
+    ] = None,
+) -> None:
+    """Build the map of one robot from what it sends, and answer questions about it.
+
+    Stops within 5 s on SIGINT or SIGTERM, after saving. Exit codes: 0 stopped and saved, 2 wrong
+    options or no session, 3 a process died, 4 the map could not be saved.
+    """
+    from rich.console import Console
+    from rich.logging import RichHandler
+
+    from hmt_service.core.config import load_config
+    from hmt_service.service.daemon import Daemon, DaemonSettings
+    from hmt_service.service.results import save_results
+    from hmt_service.service.session import Endpoints, Mode
+
+    console = Console(stderr=True)
+    handler = RichHandler(console=console, show_path=False)
+    logging.basicConfig(level=logging.INFO, format="%(message)s", handlers=[handler])
+    settings = load_config(preset, _read(config))
+    endpoints = Endpoints(
+        mode=Mode.PEER,
+        listen=tuple(listen or ([] if connect else [DEFAULT_ENDPOINT])),
+        connect=tuple(connect or []),
+        has_scouting=scouting,
+    )
+    save = partial(save_results, directory=out, config=settings) if out is not None else None
+    daemon = Daemon(
+        DaemonSettings(
+            keys=Keys(site, robot), endpoints=endpoints, config=settings, seed=seed, save=save
+        )
+    )
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda n, _: daemon.request_stop(signal.Signals(n).name))
+    report = daemon.run(
+        on_open=lambda: console.print(f"serving site {site}, robot {robot} {endpoints}")
+    )
+    _print(console, report)
+    raise typer.Exit(_exit_code(report, is_saving=save is not None))
+
+
+def _read(config: Path | None) -> str | None:
+    if config is None:
+        return None
+    try:
+        return config.read_text()
+    except OSError as error:
+        raise NotFound(f"configuration {config}: {error.strerror}") from error
+
+
+def _print(console: Console, report: StopReport) -> None:
+    counts, finished = report.status.input, report.finished
+    refused = ", ".join(f"{count} {reason}" for reason, count in counts.refused.items()) or "none"
+    console.print(
+        f"stopped by {report.reason}: {counts.received} samples received, refused {refused}; "
+        f"{report.status.processed_scans} scans in the map, {report.unprocessed} samples not in it",
+        soft_wrap=True,
+    )
+    if finished is None:
+        console.print("[red]the map was not saved: nobody was left to do it in time")
+    elif finished.failure:
+        console.print(f"[red]{finished.failure}")
+    elif finished.files:
+        console.print(f"saved {', '.join(finished.files)}")
+
+
+def _exit_code(report: StopReport, *, is_saving: bool) -> int:
+    if report.failure is not None:
+        return PROCESS_FAILED
+    is_saved = report.finished is not None and report.finished.failure is None
+    has_map = report.status.keyframes > 0
+    return NOT_SAVED if is_saving and has_map and not is_saved else 0

@@ -1,0 +1,83 @@
+"""The results of a run as files; what `hmt serve` saves.
+
+References:
+    own.
+"""
+
+from __future__ import annotations
+
+import json
+import resource
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from hmt_service import __version__
+from hmt_service.core.config import Config
+from hmt_service.errors import Unavailable
+from hmt_service.runtime.messages import RunReport
+
+if TYPE_CHECKING:
+    from hmt_service.core.engine import Engine
+
+TRAJECTORY, MAP, SUMMARY = "trajectory.tum", "map.hmt", "summary.json"
+"""Names of the files."""
+
+
+def save_results(
+    engine: Engine, report: RunReport, *, directory: Path, config: Config
+) -> tuple[str, ...]:
+    """Write trajectory, map and summary, each replaced as a whole.
+
+    Args:
+        engine: What was built.
+        report: What it has cost.
+        directory: Where to write; made when it does not exist.
+        config: Settings that it was built with.
+
+    Returns:
+        The names of the files.
+
+    Raises:
+        Unavailable: If there is no map yet.
+    """
+    from hmt_service.io.map_file import write_map
+    from hmt_service.io.trajectory import write_tum
+
+    snapshot = engine.snapshot()
+    if snapshot is None:
+        raise Unavailable(f"nothing to save: the map has no keyframe after {report.scans} scans")
+    summary = {
+        "version": __version__,
+        "config_hash": config.hash(),
+        "scans": report.scans,
+        "keyframes": snapshot.keyframes,
+        "areas": snapshot.areas,
+        "arcs": snapshot.arcs,
+        "revision": snapshot.posterior.revision,
+        "posterior": [
+            {
+                "hypothesis": hypothesis.hypothesis,
+                "probability": hypothesis.probability,
+                "areas": hypothesis.areas,
+                "loop_closures": hypothesis.loop_closures,
+            }
+            for hypothesis in snapshot.posterior.hypotheses
+        ],
+        "busy_s": {"odometry": report.odometry_busy_s, "topology": report.topology_busy_s},
+        "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+    }
+    directory.mkdir(parents=True, exist_ok=True)
+    trajectory = engine.trajectory()
+    _replace(directory / TRAJECTORY, lambda path: write_tum(path, trajectory))
+    write_map(directory / MAP, engine.stored())
+    text = json.dumps(summary, indent=2) + "\n"
+    _replace(directory / SUMMARY, lambda path: path.write_text(text))
+    return TRAJECTORY, MAP, SUMMARY
+
+
+def _replace(path: Path, write: Callable[[Path], object]) -> None:
+    """Write a file beside `path`, then put it there: nobody ever reads half of it."""
+    part = path.with_name(path.name + ".part")
+    write(part)
+    part.replace(path)
