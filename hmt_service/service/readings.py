@@ -55,6 +55,10 @@ _MAX_WRONG_SHARE = 0.5
 # A range written with centimetres and rebuilt from coordinates must not fall off the end of the
 # sensor.
 _RANGE_TOLERANCE_M = 1e-6
+# Farther than any sensor from its robot, and any robot from its start: beyond it numbers lose their
+# meaning.
+_MAX_SENSOR_OFFSET_M = 1e3
+_MAX_ODOMETRY_M = 1e7
 _FULL_TURN_RAD = 2.0 * np.pi + 1e-6
 _TYPES: dict[int, str] = {
     PackedElementField.UINT8: "u1",
@@ -232,7 +236,7 @@ def _odometry_reading(message: Odometry | PoseInFrame) -> Decoded:
         raise _RefusedError(Refusal.WRONG_FRAME)
     if not message.HasField("pose"):
         raise _RefusedError(Refusal.BAD_POSE)
-    return Decoded(OdometryReading(stamp_s, _pose(message.pose)))
+    return Decoded(OdometryReading(stamp_s, _pose(message.pose, farthest_m=_MAX_ODOMETRY_M)))
 
 
 _Decoder = Callable[[bytes, SensorConfig], Decoded]
@@ -299,16 +303,22 @@ def _names(rows: npt.NDArray[np.void]) -> tuple[str, ...]:
 def _body_from_sensor(message: LaserScan | PointCloud) -> Pose:
     if message.frame_id not in BODY_FRAMES:
         raise _RefusedError(Refusal.WRONG_FRAME)
-    return _pose(message.pose) if message.HasField("pose") else identity()
+    if not message.HasField("pose"):
+        return identity()
+    return _pose(message.pose, farthest_m=_MAX_SENSOR_OFFSET_M)
 
 
-def _pose(message: PoseMessage) -> Pose:
+def _pose(message: PoseMessage, *, farthest_m: float) -> Pose:
     p, q = message.position, message.orientation
     quaternion = [q.x, q.y, q.z, q.w] if message.HasField("orientation") else [0.0, 0.0, 0.0, 1.0]
     try:
-        return pose_of(np.array(quaternion), np.array([p.x, p.y, p.z]))
+        with np.errstate(over="ignore"):
+            pose = pose_of(np.array(quaternion), np.array([p.x, p.y, p.z]))
     except InvalidInput as error:
         raise _RefusedError(Refusal.BAD_POSE) from error
+    if np.abs(pose[:3, 3]).max() > farthest_m:
+        raise _RefusedError(Refusal.BAD_POSE)
+    return pose
 
 
 def _pose_to_proto(pose: Pose) -> PoseMessage:

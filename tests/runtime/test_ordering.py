@@ -1,0 +1,96 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hmt_service.core.geometry import identity
+from hmt_service.core.types import OdometryReading, Reading, Scan
+from hmt_service.runtime.ordering import ReorderWindow
+
+
+def scan(stamp_s: float) -> Scan:
+    return Scan(stamp_s, np.zeros((0, 3)), np.zeros(3))
+
+
+def odometry(stamp_s: float) -> OdometryReading:
+    return OdometryReading(stamp_s, identity())
+
+
+def key(reading: Reading) -> tuple[float, bool]:
+    return reading.stamp_s, isinstance(reading, Scan)
+
+
+def through(window: ReorderWindow, readings: list[Reading]) -> list[Reading]:
+    released: list[Reading] = []
+    for reading in readings:
+        taken = window.push(reading)
+        assert taken is not None
+        released += taken
+    return [*released, *window.flush()]
+
+
+# Sixteenths are exact in binary: sums of them compare without rounding.
+steps = st.integers(0, 8).map(lambda n: n / 16.0)
+
+
+@given(st.lists(st.tuples(steps, st.booleans())))
+def test_readings_in_order_come_out_in_the_order_of_the_offline_run(
+    moves: list[tuple[float, bool]],
+) -> None:
+    stamp_s, readings = 100.0, list[Reading]()
+    for step, is_scan in moves:
+        stamp_s += step
+        readings.append(scan(stamp_s) if is_scan else odometry(stamp_s))
+    assert through(ReorderWindow(0.25), readings) == sorted(readings, key=key)
+
+
+@given(st.lists(st.tuples(st.integers(0, 64), st.integers(0, 3), st.booleans())))
+def test_readings_late_by_less_than_the_window_are_put_in_order(
+    sent: list[tuple[int, int, bool]],
+) -> None:
+    readings = [
+        (sent_at + late, scan(sent_at / 16.0) if is_scan else odometry(sent_at / 16.0))
+        for sent_at, late, is_scan in sent
+    ]
+    arrived = [reading for _, reading in sorted(readings, key=lambda entry: entry[0])]
+    assert through(ReorderWindow(0.25), arrived) == sorted(arrived, key=key)
+
+
+def test_odometry_of_the_same_stamp_comes_before_the_scan() -> None:
+    late, early = odometry(1.0), scan(1.0)
+    assert through(ReorderWindow(0.25), [early, late]) == [late, early]
+
+
+def test_a_reading_older_than_a_released_one_is_refused() -> None:
+    window = ReorderWindow(0.25)
+    window.push(scan(1.0))
+    window.push(scan(2.0))
+    assert window.released_s == 1.0
+    assert window.push(scan(0.9)) is None
+    assert len(window) == 1
+
+
+def test_a_reading_as_old_as_a_released_one_is_taken() -> None:
+    window = ReorderWindow(0.25)
+    window.push(scan(1.0))
+    window.flush()
+    assert window.push(odometry(1.0)) == ()
+    assert len(window) == 1
+
+
+def test_a_stamp_far_ahead_does_not_lock_out_the_others() -> None:
+    window = ReorderWindow(0.25)
+    readings: list[Reading] = [scan(1.0), scan(9e9), scan(1.1), scan(1.2)]
+    assert through(window, readings) == [readings[0], readings[2], readings[3], readings[1]]
+
+
+def test_nothing_is_released_before_the_window_has_passed() -> None:
+    window = ReorderWindow(0.25)
+    first, second, third = scan(1.0), scan(1.25), scan(1.26)
+    assert window.released_s == -math.inf
+    assert window.push(first) == ()
+    assert window.push(second) == ()
+    assert window.push(third) == (first,)

@@ -1,0 +1,260 @@
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from hmt_service.core.config import Config, load_config
+from hmt_service.core.engine import Engine
+from hmt_service.core.odometry import Odometry
+from hmt_service.core.types import Event, GlobalMap, MapMethod, Reading, Scan, Tracking
+from hmt_service.errors import DeadlineExceeded, NotFound, Unavailable
+from hmt_service.runtime.messages import (
+    CompareRequest,
+    Finish,
+    Finished,
+    Mapped,
+    MapRequest,
+    ProcessName,
+    Request,
+    Result,
+    RunReport,
+    SaveRequest,
+)
+from hmt_service.runtime.pipeline import Pipeline
+from tests.flat import SETTINGS, readings
+
+DEADLINE_S = 20.0
+
+
+def save_area_count(engine: Engine, report: RunReport) -> tuple[str, ...]:
+    """Stand for the files: what is known here is told in a name."""
+    snapshot = engine.snapshot()
+    assert snapshot is not None
+    return (f"{snapshot.areas} areas of {report.scans} scans",)
+
+
+def fail_to_save(_engine: Engine, _report: RunReport) -> tuple[str, ...]:
+    raise OSError(28, "No space left on device")
+
+
+class Recorder:
+    """Keeps what the pipeline tells."""
+
+    def __init__(self) -> None:
+        self.trackings: list[Tracking] = []
+        self.mapped: list[Mapped] = []
+        self.finished: list[Finished] = []
+        self._has_finished = threading.Event()
+
+    def on_tracking(self, tracking: Tracking) -> None:
+        self.trackings.append(tracking)
+
+    def on_map(self, mapped: Mapped) -> None:
+        self.mapped.append(mapped)
+        if mapped.finished is not None:
+            self.finished.append(mapped.finished)
+            self._has_finished.set()
+
+    def wait(self) -> Finished:
+        assert self._has_finished.wait(DEADLINE_S)
+        self._has_finished.clear()
+        return self.finished[-1]
+
+
+class Answers:
+    """Collects the one answer to a request."""
+
+    def __init__(self, pipeline: Pipeline, request: Request, timeout_s: float = DEADLINE_S) -> None:
+        self.results: list[Result] = []
+        self._is_there = threading.Event()
+        pipeline.request(request, self._take, timeout_s=timeout_s)
+
+    def _take(self, result: Result) -> None:
+        self.results.append(result)
+        self._is_there.set()
+
+    def wait(self) -> Result:
+        assert self._is_there.wait(DEADLINE_S)
+        return self.results[0]
+
+
+class Running:
+    """A pipeline with both processes, its listener, and what it is fed."""
+
+    def __init__(self, pipeline: Pipeline, recorder: Recorder) -> None:
+        self.pipeline = pipeline
+        self.recorder = recorder
+        self._finishes = 0
+
+    def feed(self, sent: list[Reading]) -> None:
+        for reading in sent:
+            assert self.pipeline.submit(reading)
+
+    def finish(self) -> Finished:
+        self._finishes += 1
+        assert self.pipeline.finish(Finish(self._finishes))
+        return self.recorder.wait()
+
+    def pid(self, name: ProcessName) -> int:
+        return next(status.pid for status in self.pipeline.status() if status.name == name)
+
+
+@pytest.fixture
+def config() -> Config:
+    return load_config(text=SETTINGS)
+
+
+@pytest.fixture
+def running(config: Config) -> Iterator[Running]:
+    pipeline, recorder = Pipeline(config, save=save_area_count), Recorder()
+    pipeline.start(recorder)
+    yield Running(pipeline, recorder)
+    pipeline.stop(0.0)
+
+
+def test_the_processes_make_the_map_that_one_process_makes(
+    running: Running, config: Config
+) -> None:
+    sent = readings(160)
+    odometry, engine = Odometry(config), Engine(config)
+    events: list[Event] = []
+    for reading in sent:
+        if (tracking := odometry.process(reading)) is not None:
+            events += engine.process(tracking)
+    events += engine.finish()
+    expected = engine.global_map(MapMethod.CONSISTENT)
+
+    running.feed(sent)
+    finished = running.finish()
+    answer = Answers(running.pipeline, MapRequest(MapMethod.CONSISTENT)).wait()
+
+    assert finished.files == (f"{len(expected.areas)} areas of 160 scans",)
+    assert isinstance(answer, GlobalMap)
+    assert [event for mapped in running.recorder.mapped for event in mapped.events] == events
+    for mine, theirs in zip(answer.areas, expected.areas, strict=True):
+        assert (mine.area, mine.keyframes, mine.visits) == (
+            theirs.area,
+            theirs.keyframes,
+            theirs.visits,
+        )
+        # Here the linear algebra has more threads than in the children: equal up to rounding.
+        np.testing.assert_allclose(
+            mine.reference_from_area.mean, theirs.reference_from_area.mean, atol=1e-9
+        )
+        np.testing.assert_allclose(mine.points_in_area, theirs.points_in_area, atol=1e-6)
+
+
+def test_readings_come_back_in_order_and_are_counted(running: Running) -> None:
+    sent = readings(40)
+    running.feed(sent)
+    running.finish()
+    stamps = [tracking.stamp_s for tracking in running.recorder.trackings]
+    assert stamps == [reading.stamp_s for reading in sent if isinstance(reading, Scan)]
+    odometry, topology = running.pipeline.status()
+    assert (odometry.processed, topology.processed) == (80, 40)
+    assert (odometry.backlog, topology.backlog) == (0, 0)
+    assert running.pipeline.tracked_scans == 40
+
+
+def test_input_may_follow_a_finish(running: Running) -> None:
+    sent = readings(40)
+    running.feed(sent[:40])
+    assert running.finish() == Finished(1, ("1 areas of 20 scans",))
+    running.feed(sent[40:])
+    assert running.finish() == Finished(2, ("1 areas of 40 scans",))
+
+
+def test_questions_are_answered_with_typed_errors(running: Running) -> None:
+    before = Answers(running.pipeline, CompareRequest()).wait()
+    assert isinstance(before, Unavailable)
+    running.feed(readings(20))
+    running.finish()
+    unknown = Answers(running.pipeline, MapRequest(MapMethod.CONSISTENT, reference_area=99)).wait()
+    assert isinstance(unknown, NotFound)
+    assert "99" in str(unknown)
+
+
+def test_a_late_answer_is_an_error_and_the_next_one_belongs_to_its_question(
+    running: Running,
+) -> None:
+    running.feed(readings(20))
+    late = Answers(running.pipeline, MapRequest(MapMethod.CONSISTENT), timeout_s=-1.0)
+    running.pipeline.tick()
+    assert isinstance(late.wait(), DeadlineExceeded)
+    running.finish()
+    assert Answers(running.pipeline, SaveRequest()).wait() == ("1 areas of 20 scans",)
+    assert len(late.results) == 1
+
+
+def test_too_many_questions_at_once_are_refused(running: Running) -> None:
+    running.feed(readings(20))
+    asked = [
+        Answers(running.pipeline, MapRequest(MapMethod.SHORTEST_PATH, with_points=False))
+        for _ in range(100)
+    ]
+    answers = [one.wait() for one in asked]
+    refused = [answer for answer in answers if isinstance(answer, Unavailable)]
+    assert refused
+    assert all("32 wait" in str(answer) or "keyframe" in str(answer) for answer in refused)
+
+
+@pytest.mark.parametrize("name", [ProcessName.ODOMETRY, ProcessName.TOPOLOGY])
+def test_a_killed_process_is_noticed_at_once_by_name_and_signal(
+    running: Running, name: ProcessName
+) -> None:
+    running.feed(readings(20))
+    assert running.pipeline.failure(0.0) is None
+    pid = running.pid(name)
+    os.kill(pid, signal.SIGKILL)
+    started_s = time.monotonic()
+    failure = running.pipeline.failure(DEADLINE_S)
+    assert time.monotonic() - started_s < 1.0
+    assert str(failure) == f"process {name} (pid {pid}) was killed by SIGKILL"
+
+
+def test_the_map_survives_the_odometry(running: Running) -> None:
+    running.feed(readings(20))
+    running.finish()
+    os.kill(running.pid(ProcessName.ODOMETRY), signal.SIGKILL)
+    assert running.pipeline.failure(DEADLINE_S) is not None
+    assert running.pipeline.is_alive(ProcessName.TOPOLOGY)
+    assert running.pipeline.finish_map(Finish(7))
+    assert running.recorder.wait() == Finished(7, ("1 areas of 20 scans",))
+
+
+def test_submit_returns_false_instead_of_waiting_for_a_dead_process(running: Running) -> None:
+    sent = readings(3000)
+    os.kill(running.pid(ProcessName.ODOMETRY), signal.SIGKILL)
+    assert not all(running.pipeline.submit(reading) for reading in sent)
+
+
+def test_a_map_that_cannot_be_saved_is_reported_and_kept(config: Config) -> None:
+    pipeline, recorder = Pipeline(config, save=fail_to_save), Recorder()
+    pipeline.start(recorder)
+    running = Running(pipeline, recorder)
+    running.feed(readings(20))
+    finished = running.finish()
+    assert finished.files == ()
+    assert finished.failure is not None
+    assert "No space left on device" in finished.failure
+    assert isinstance(
+        Answers(pipeline, MapRequest(MapMethod.CONSISTENT, with_points=False)).wait(), GlobalMap
+    )
+    assert pipeline.stop(5.0) == ()
+
+
+def test_stop_ends_processes_and_answers_what_waits(running: Running) -> None:
+    running.feed(readings(100))
+    pids = [status.pid for status in running.pipeline.status()]
+    asked = [Answers(running.pipeline, MapRequest(MapMethod.CONSISTENT)) for _ in range(8)]
+    running.pipeline.stop(0.2)
+    assert all(len(one.results) == 1 for one in asked)
+    for pid in pids:
+        with pytest.raises(ProcessLookupError):
+            os.kill(pid, 0)

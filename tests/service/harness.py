@@ -1,0 +1,100 @@
+"""Factories of the service's tests: messages, and real daemons on loopback."""
+
+from __future__ import annotations
+
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from foxglove_schemas_protobuf.LaserScan_pb2 import LaserScan
+from google.protobuf.timestamp_pb2 import Timestamp
+
+from hmt_service.core.geometry import FloatArray
+from hmt_service.errors import Unavailable
+from hmt_service.service.client import HmtClient
+from hmt_service.service.reports import DaemonState
+from tests.flat import SETTINGS
+
+DEADLINE_S = 20.0
+
+
+def laser_scan(ranges: Sequence[float] | FloatArray, *, stamp_s: float = 0.0) -> LaserScan:
+    """Return a full turn of ranges as foxglove message."""
+    count = len(ranges)
+    seconds = int(stamp_s)
+    return LaserScan(
+        timestamp=Timestamp(seconds=seconds, nanos=int((stamp_s - seconds) * 1e9)),
+        frame_id="body",
+        start_angle=-np.pi,
+        end_angle=np.pi - 2.0 * np.pi / max(1, count),
+        ranges=list(ranges),
+    )
+
+
+def wait_until(is_true: Callable[[], bool], *, timeout_s: float = DEADLINE_S) -> None:
+    """Return as soon as the condition holds; fail when it does not in time."""
+    deadline_s = time.monotonic() + timeout_s
+    while not is_true():
+        assert time.monotonic() < deadline_s, f"not within {timeout_s} s"
+        time.sleep(0.01)
+
+
+def free_endpoint() -> str:
+    """Return a loopback endpoint that nobody listens on."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+@dataclass
+class RunningDaemon:
+    """`hmt serve` in a process of its own."""
+
+    endpoint: str
+    out: Path
+    process: subprocess.Popen[str]
+
+    def client(self) -> HmtClient:
+        return HmtClient(self.endpoint)
+
+    def output(self) -> str:
+        """Wait for the end and return what was printed."""
+        text, _ = self.process.communicate(timeout=DEADLINE_S)
+        return " ".join(text.split())
+
+
+@contextmanager
+def running_daemon(out: Path, *arguments: str, is_awaited: bool = True) -> Iterator[RunningDaemon]:
+    """Run a daemon; it is ready for work unless `is_awaited` is false, and is killed at the end."""
+    endpoint = free_endpoint()
+    settings = out.parent / "settings.yaml"
+    settings.write_text(SETTINGS)
+    command = [sys.executable, "-m", "hmt_service", "serve", "--listen", endpoint]
+    with subprocess.Popen(
+        [*command, "--config", str(settings), "--out", str(out), *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    ) as process:
+        daemon = RunningDaemon(endpoint, out, process)
+        try:
+            if is_awaited:
+                wait_until(lambda: _is_running(daemon))
+            yield daemon
+        finally:
+            process.kill()
+
+
+def _is_running(daemon: RunningDaemon) -> bool:
+    assert daemon.process.poll() is None, daemon.output()
+    try:
+        with daemon.client() as client:
+            return client.status().state is DaemonState.RUNNING
+    except Unavailable:
+        return False

@@ -1,0 +1,214 @@
+"""How the daemon starts and ends, with `hmt serve` in a process of its own."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import pytest
+import zenoh
+from typer.testing import CliRunner
+
+from hmt_service.cli.app import app
+from hmt_service.cli.serve import PROCESS_FAILED
+from hmt_service.core.types import Event
+from hmt_service.errors import DaemonFailure, HmtError
+from hmt_service.io.trajectory import read_tum
+from hmt_service.runtime.messages import ProcessName
+from hmt_service.service.client import HmtClient
+from hmt_service.service.codec import decode
+from hmt_service.service.keys import Call, Keys, Topic
+from hmt_service.service.reports import DaemonState
+from hmt_service.service.session import Endpoints, Mode, open_session
+from tests.flat import readings
+from tests.service.harness import RunningDaemon, running_daemon, wait_until
+
+FILES = ["map.hmt", "summary.json", "trajectory.tum"]
+
+
+def publish(client: HmtClient, scans: int) -> None:
+    for reading in readings(scans):
+        client.publish(reading)
+
+
+def pid_of(client: HmtClient, name: ProcessName) -> int:
+    return next(process.pid for process in client.status().processes if process.name == name)
+
+
+def is_alive(pid: int) -> bool:
+    try:
+        # A dead child of a dead parent may wait for init as a zombie.
+        return "Z" not in Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except OSError:
+        return False
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_stops_the_daemon_in_time_with_everything_saved(
+    tmp_path: Path, number: signal.Signals
+) -> None:
+    with running_daemon(tmp_path / "out") as daemon, daemon.client() as client:
+        publish(client, 100)
+        started_s = time.monotonic()
+        daemon.process.send_signal(number)
+        output = daemon.output()
+        assert time.monotonic() - started_s < 5.0
+    assert daemon.process.returncode == 0
+    assert f"stopped by {number.name}: 200 samples received, refused none" in output
+    assert "100 scans in the map, 0 samples not in it" in output
+    assert sorted(path.name for path in daemon.out.iterdir()) == FILES
+    assert len(read_tum(daemon.out / "trajectory.tum")) == 100
+    assert json.loads((daemon.out / "summary.json").read_text())["scans"] == 100
+
+
+def test_a_signal_to_the_whole_group_is_left_to_the_parent(tmp_path: Path) -> None:
+    """A terminal and systemd signal the children too."""
+    with running_daemon(tmp_path / "out") as daemon, daemon.client() as client:
+        publish(client, 40)
+        for name in (ProcessName.ODOMETRY, ProcessName.TOPOLOGY):
+            os.kill(pid_of(client, name), signal.SIGTERM)
+            os.kill(pid_of(client, name), signal.SIGINT)
+        daemon.process.terminate()
+        assert "40 scans in the map" in daemon.output()
+    assert daemon.process.returncode == 0
+
+
+def test_more_input_than_time_is_counted_and_the_rest_saved(tmp_path: Path) -> None:
+    with running_daemon(tmp_path / "out") as daemon, daemon.client() as client:
+        publish(client, 4000)
+        started_s = time.monotonic()
+        daemon.process.terminate()
+        output = daemon.output()
+        assert time.monotonic() - started_s < 5.0
+    mapped = len(read_tum(daemon.out / "trajectory.tum"))
+    assert 0 < mapped < 4000
+    assert f"{mapped} scans in the map" in output
+    # Neither lost nor counted twice: a scan is one sample, and so is its odometry.
+    missing = re.search(r"(\d+) samples not in it", output)
+    assert missing is not None
+    assert 4000 - mapped <= int(missing[1]) <= 2 * (4000 - mapped)
+    assert daemon.process.returncode == 0
+
+
+def test_a_daemon_without_input_stops_without_error(tmp_path: Path) -> None:
+    with running_daemon(tmp_path / "out") as daemon:
+        daemon.process.terminate()
+        assert "no keyframe" in daemon.output()
+    assert daemon.process.returncode == 0
+
+
+def test_a_daemon_that_still_loads_can_be_stopped(tmp_path: Path) -> None:
+    with running_daemon(tmp_path / "out", is_awaited=False) as daemon:
+        assert daemon.process.stderr is None
+        assert daemon.process.stdout is not None
+        assert "serving" in daemon.process.stdout.readline()
+        started_s = time.monotonic()
+        daemon.process.terminate()
+        daemon.output()
+        assert time.monotonic() - started_s < 5.0
+    assert daemon.process.returncode == 0
+
+
+def test_a_client_can_stop_the_daemon(tmp_path: Path) -> None:
+    with running_daemon(tmp_path / "out") as daemon, daemon.client() as client:
+        publish(client, 20)
+        assert client.shut_down().received == 40
+        assert "stopped by a client: 40 samples received" in daemon.output()
+    assert daemon.process.returncode == 0
+
+
+@pytest.mark.parametrize("name", [ProcessName.ODOMETRY, ProcessName.TOPOLOGY])
+def test_a_killed_process_ends_the_daemon_at_once_with_its_name(
+    tmp_path: Path, name: ProcessName
+) -> None:
+    with running_daemon(tmp_path / "out") as daemon, daemon.client() as client:
+        publish(client, 60)
+        client.finish()
+        for path in daemon.out.iterdir():
+            path.unlink()
+        pid = pid_of(client, name)
+        with recorded_events(daemon) as events:
+            started_s = time.monotonic()
+            os.kill(pid, signal.SIGKILL)
+            output = daemon.output()
+            assert time.monotonic() - started_s < 5.0
+    reason = f"process {name} (pid {pid}) was killed by SIGKILL"
+    assert daemon.process.returncode == PROCESS_FAILED
+    assert f"stopped by {reason}" in output
+    assert [event.kind for event in events if event.message == reason] == ["process_failed"]
+    # The map is the topology's: it survives the odometry.
+    is_saved = name is ProcessName.ODOMETRY
+    assert sorted(path.name for path in daemon.out.iterdir()) == (FILES if is_saved else [])
+    assert ("not saved" in output) is not is_saved
+
+
+@contextmanager
+def recorded_events(daemon: RunningDaemon) -> Iterator[list[Event]]:
+    """Collect what the daemon publishes as events."""
+    events: list[Event] = []
+
+    def take(sample: zenoh.Sample) -> None:
+        event = decode(sample.payload.to_bytes(), str(sample.encoding))
+        assert isinstance(event, Event)
+        events.append(event)
+
+    endpoints = Endpoints(mode=Mode.CLIENT, connect=(daemon.endpoint,))
+    with open_session(endpoints) as session:
+        session.declare_subscriber(Keys("site", "robot").topic(Topic.EVENT), take)
+        # The subscription is known to the daemon when this later message has come back.
+        list(session.get(Keys("site", "robot").call(Call.STATUS)))
+        yield events
+
+
+def test_children_end_when_the_parent_is_killed(tmp_path: Path) -> None:
+    with running_daemon(tmp_path / "out") as daemon, daemon.client() as client:
+        publish(client, 40)
+        pids = [process.pid for process in client.status().processes]
+        daemon.process.kill()
+        wait_until(lambda: not any(map(is_alive, pids)), timeout_s=5.0)
+
+
+def test_a_call_that_waits_when_the_daemon_dies_gets_an_error(tmp_path: Path) -> None:
+    with running_daemon(tmp_path / "out") as daemon, daemon.client() as client:
+        publish(client, 2000)
+        pid = pid_of(client, ProcessName.ODOMETRY)
+        with ThreadPoolExecutor(max_workers=1) as pool:
+            waiting = pool.submit(client.finish, timeout_s=60.0)
+            wait_until(lambda: client.status().processed_scans > 0)
+            os.kill(pid, signal.SIGKILL)
+            started_s = time.monotonic()
+            # Either the survivor finishes what it has, or nobody does; never silence.
+            with suppress(HmtError):
+                assert waiting.result(timeout=10.0).processed_scans < 2000
+            assert time.monotonic() - started_s < 8.0
+        assert daemon.process.wait(5.0) == PROCESS_FAILED
+
+
+def test_a_second_daemon_of_the_same_robot_is_refused(tmp_path: Path) -> None:
+    with running_daemon(tmp_path / "out") as daemon:
+        arguments = ["serve", "--connect", daemon.endpoint]
+        result = CliRunner().invoke(app, arguments)
+        assert isinstance(result.exception, DaemonFailure)
+        assert "another daemon" in str(result.exception)
+        with daemon.client() as client:
+            assert client.status().state is DaemonState.RUNNING
+
+
+def test_an_endpoint_in_use_is_one_line_and_exit_code_2(tmp_path: Path) -> None:
+    with running_daemon(tmp_path / "out") as daemon:
+        command = [sys.executable, "-m", "hmt_service", "serve", "--robot", "two"]
+        result = subprocess.run(
+            [*command, "--listen", daemon.endpoint], capture_output=True, text=True, timeout=20.0
+        )
+    assert result.returncode == 2
+    assert daemon.endpoint in result.stderr
+    assert "Traceback" not in result.stderr
