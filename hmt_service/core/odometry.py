@@ -172,25 +172,25 @@ class Odometry:
         return self._fuse(GaussianPose(pose, registered), predicted), None
 
     def _fuse(self, registered: GaussianPose, predicted: GaussianPose) -> GaussianPose:
-        """Return the product of registration and motion prior; the scan alone where they disagree.
+        """Return the product of registration and motion prior, the prior widened where they disagree.
 
-        The prior fills the directions that the scan does not see. It is not trusted when it
-        contradicts the scan in those that it does (wheel slip).
+        The prior fills the directions that the scan does not see. Where it contradicts the scan beyond
+        the gate (wheel slip), it is widened until it no longer does, so that it loses its say there and
+        still bounds what nothing else does.
         """
         block = np.ix_(self._axes, self._axes)
         gap = log(inverse(registered.mean) @ predicted.mean)[self._axes]
         scan_covariance = registered.covariance[block] + self._floor()[block]
         prior_covariance = predicted.covariance[block]
         together = scan_covariance + prior_covariance
-        covariance = np.zeros((6, 6))
-        if gap @ np.linalg.solve(together, gap) > _GATE[len(self._axes)]:
-            step = np.zeros(6)
-            covariance[block] = scan_covariance
-        else:
-            gain = np.linalg.solve(together, scan_covariance).T
-            step = np.zeros(6)
-            step[self._axes] = gain @ gap
-            covariance[block] = symmetric(scan_covariance - gain @ scan_covariance)
+        excess = float(gap @ np.linalg.solve(together, gap)) / _GATE[len(self._axes)]
+        if excess > 1.0:
+            prior_covariance = prior_covariance * excess
+            together = scan_covariance + prior_covariance
+        gain = np.linalg.solve(together, scan_covariance).T
+        step, covariance = np.zeros(6), np.zeros((6, 6))
+        step[self._axes] = gain @ gap
+        covariance[block] = symmetric(scan_covariance - gain @ scan_covariance)
         if self._sensor.is_planar:
             covariance = planar_covariance(covariance)
         return GaussianPose(registered.mean @ exp(step), covariance)

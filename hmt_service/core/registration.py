@@ -29,6 +29,8 @@ _NORMAL_NEIGHBOURS = 8
 # A neighbourhood thicker than this share of its width has no surface to speak of.
 _MAX_FLATNESS = 0.25
 _UNBOUNDED_M = 1e9
+# A direction opposed by less than this share of what opposes the best-known one is degenerate.
+_DEGENERATE_SHARE = 0.05
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -127,7 +129,8 @@ class RegistrationMap:
         normals_in_points = normals @ map_from_points[:3, :3]
         sources = points[is_inlier]
         rows = np.hstack([np.cross(sources, normals_in_points), normals_in_points])[is_surface]
-        return Match(map_from_points, symmetric(rows.T @ rows), share)
+        information = _without_degenerate_directions(symmetric(rows.T @ rows))
+        return Match(map_from_points, information, share)
 
     def inlier_share(self, points: FloatArray, map_from_points: Pose, *, inlier_m: float) -> float:
         """Return the share of the cloud within `inlier_m` of the map, in [0, 1]."""
@@ -151,6 +154,19 @@ class RegistrationMap:
         normals = np.zeros((len(indices), 3))
         normals[:, : vectors.shape[1]] = vectors[..., 0]
         return normals, values[:, 0] <= _MAX_FLATNESS**2 * values[:, 1]
+
+
+def _without_degenerate_directions(information: FloatArray) -> FloatArray:
+    """Return the information without that of translations which almost no surface opposes.
+
+    Along a corridor only clutter and bad normals oppose a translation; what they say is not noise of
+    zero mean, and to average it would make the robot slip with great confidence.
+    """
+    values, vectors = np.linalg.eigh(information[3:, 3:])
+    seen = vectors[:, values >= _DEGENERATE_SHARE * values[-1]]
+    keep = np.eye(6)
+    keep[3:, 3:] = seen @ seen.T
+    return symmetric(keep @ information @ keep)
 
 
 def covariance_of(information: FloatArray, *, sigma_m: float, is_planar: bool) -> FloatArray:
