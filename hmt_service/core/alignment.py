@@ -1,4 +1,4 @@
-"""Alignment of two submaps: all relative poses that their contents allow inside a prior, each with its covariance.
+"""Alignment of two submaps: all relative poses that their contents allow inside a prior.
 
 References:
     Design section 2.4, step 2 (correlation of bird's-eye views over rotations, then registration).
@@ -77,14 +77,15 @@ class Aligner:
     def refine(self, visit: Visit, target: Visit, guess: Pose) -> Mode | None:
         """Return the mode whose basin a guess lies in, or None when the submaps disagree there."""
         config = self._config
-        pose: Pose | None = guess
+        pose = guess
         # Coarse to fine: the first pass bridges the raster, the second the voxel.
         for reach_m in (4.0 * config.inlier_m, 1.5 * config.inlier_m):
-            pose = target.registration_map.register(
+            registered = target.registration_map.register(
                 visit.points, pose, max_correspondence_m=reach_m, kernel_m=0.3 * reach_m
             )
-            if pose is None:
+            if registered is None:
                 return None
+            pose = registered
         match = target.registration_map.match(visit.points, pose, inlier_m=config.inlier_m)
         if match.inlier_share < config.min_overlap:
             return None
@@ -126,7 +127,9 @@ class Aligner:
 
         centred = visit.points - visit.centre
         extent = int(np.ceil(np.abs(centred[:, :2]).max() * np.sqrt(2.0) / cell)) + 1
-        shape = tuple(fft.next_fast_len(int(n) + 2 * extent + 1, real=True) for n in (height, width))
+        shape = tuple(
+            fft.next_fast_len(int(n) + 2 * extent + 1, real=True) for n in (height, width)
+        )
         spectrum = fft.rfft2(raster, shape)
         # Where the middle of the visit is expected to be in the target's frame.
         expected = transform_points(prior.mean, visit.centre[None])[0]
@@ -178,7 +181,9 @@ class Aligner:
 
     def _is_in_gate(self, mode: Mode, prior: GaussianPose) -> bool:
         together = GaussianPose(prior.mean, prior.covariance + mode.target_from_visit.covariance)
-        return together.mahalanobis2(mode.target_from_visit.mean) <= self._config.gate_sigma**2 + 6.0
+        return (
+            together.mahalanobis2(mode.target_from_visit.mean) <= self._config.gate_sigma**2 + 6.0
+        )
 
     def _distinct(self, modes: list[Mode]) -> tuple[Mode, ...]:
         kept: list[Mode] = []

@@ -66,7 +66,8 @@ def partition(overlap: FloatArray, *, max_cut: float, min_keyframes: int) -> Spl
     an approximation of a cut that need not be contiguous.
 
     Args:
-        overlap: Pairwise keyframe overlap in [0, 1], symmetric, in time order, shape (K, K), K >= 2.
+        overlap: Pairwise keyframe overlap in [0, 1], symmetric, in time order, shape (K, K),
+            K >= 2.
         max_cut: Largest normalized cut accepted as a border, in [0, 2].
         min_keyframes: Fewest keyframes on either side.
 

@@ -1,8 +1,8 @@
 """Arcs between areas, and global poses by composing them along shortest paths.
 
 References:
-    Blanco et al. 2008, section IV-C, Eq. (10) (fusion of independent traversals), Eq. (15) (composition by
-    Monte Carlo) and Fig. 7.
+    Blanco et al. 2008, section IV-C, Eq. (10) (fusion of independent traversals), Eq. (15)
+    (composition by Monte Carlo) and Fig. 7.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def compose_shortest_paths(
     Returns:
         `reference_from_area` by area, the reference itself included.
     """
-    graph = nx.Graph()
+    graph: nx.Graph[int] = nx.Graph()
     graph.add_node(reference)
     relative: dict[tuple[int, int], GaussianPose] = {}
     for arc in arcs:
@@ -88,7 +88,9 @@ def compose_shortest_paths(
         )
         relative[arc.area_a, arc.area_b] = arc.a_from_b
         relative[arc.area_b, arc.area_a] = arc.a_from_b.inverse()
-    predecessors, distances = nx.dijkstra_predecessor_and_distance(graph, reference, weight="length")
+    predecessors, distances = nx.dijkstra_predecessor_and_distance(
+        graph, reference, weight="length"
+    )
     poses = {reference: certain(identity())}
     samples: dict[int, FloatArray] = {reference: np.broadcast_to(identity(), (_SAMPLES, 4, 4))}
     for area in sorted(distances, key=distances.__getitem__):

@@ -1,4 +1,4 @@
-"""Settings of every stage and the presets per kind of sensor; nothing here depends on a particular log.
+"""Settings of every stage and the presets per kind of sensor; none depends on a particular log.
 
 References:
     own; the values marked "measured" come from the recorded logs named in the README.
@@ -85,7 +85,7 @@ class CovarianceConfig(Section):
     """From a registration's information to an honest covariance."""
 
     sigma_m: float = Field(default=0.02, gt=0.0)
-    """Standard deviation of one point-to-plane residual, including the correlation between points."""
+    """Standard deviation of one point-to-plane residual; makes up for correlated points too."""
     floor_m: float = Field(default=0.005, gt=0.0)
     """Least standard deviation of a registered translation."""
     floor_rad: float = Field(default=0.002, gt=0.0)
@@ -153,7 +153,7 @@ class RefinementConfig(Section):
 
 
 class ObservationConfig(Section):
-    """Likelihood of a scan given a submap, and the background density (section 2.3 of the design)."""
+    """Likelihood of a scan given a submap, against the background density."""
 
     hit_sigma_m: float = Field(default=0.15, gt=0.0)
     """Standard deviation of a range around the expected one, submap error included."""
@@ -246,7 +246,9 @@ def load_config(preset: Preset = Preset.PLANAR, text: str | None = None) -> Conf
     if changes is None:
         changes = {}
     if not isinstance(changes, dict):
-        raise InvalidConfig(f"configuration is a {type(changes).__name__}, not a mapping of sections")
+        raise InvalidConfig(
+            f"configuration is a {type(changes).__name__}, not a mapping of sections"
+        )
     merged: dict[str, Any] = {name: dict(values) for name, values in _PRESETS[preset].items()}
     for name, values in changes.items():
         merged[name] = {**merged.get(name, {}), **values} if isinstance(values, dict) else values
@@ -254,5 +256,3 @@ def load_config(preset: Preset = Preset.PLANAR, text: str | None = None) -> Conf
         return Config.model_validate(merged)
     except ValidationError as error:
         raise InvalidConfig(f"configuration refused: {error}") from error
-
-

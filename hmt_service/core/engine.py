@@ -1,8 +1,8 @@
 """The engine: keyframes become areas, areas become hypotheses, hypotheses become maps.
 
-`Engine.process` is the paper's Fig. 8 without its threads: area abstraction, topological Bayesian inference, weights,
-graph. It is a plain object without clock, thread, file or socket; the same trackings and the same seed give the same
-map, bit for bit.
+`Engine.process` is the paper's Fig. 8 without its threads: area abstraction, topological Bayesian
+inference, weights, graph. It is a plain object without clock, thread, file or socket; the same
+trackings and the same seed give the same map, bit for bit.
 
 References:
     Blanco et al. 2008, section V and Fig. 8.
@@ -18,10 +18,11 @@ from hmt_service.core.alignment import Aligner
 from hmt_service.core.area_abstraction import overlap_of, partition
 from hmt_service.core.composition import arcs_of, compose_shortest_paths, residual_m
 from hmt_service.core.config import Config
-from hmt_service.core.geometry import GaussianPose, Pose, certain, identity, inverse, log
+from hmt_service.core.geometry import GaussianPose, Pose, inverse, log
 from hmt_service.core.graph import Factor, PoseGraph
 from hmt_service.core.hypotheses import Assignment, Hypothesis, ParticleLayer
 from hmt_service.core.observation import ObservationModel
+from hmt_service.core.refinement import Refinement
 from hmt_service.core.stored import (
     StoredAssignment,
     StoredFactor,
@@ -31,7 +32,6 @@ from hmt_service.core.stored import (
     StoredVisit,
 )
 from hmt_service.core.submap import Visit, as_points, visit_of
-from hmt_service.core.refinement import Refinement
 from hmt_service.core.transition import Successor, Transition
 from hmt_service.core.types import (
     ArcResidual,
@@ -40,7 +40,6 @@ from hmt_service.core.types import (
     Event,
     EventKind,
     GlobalMap,
-    HmtPose,
     Keyframe,
     MapMethod,
     PlacedArea,
@@ -360,8 +359,7 @@ class Engine:
         return tuple(
             StampedPose(
                 tracking.stamp_s,
-                reference_from_keyframe[tracking.keyframe_index]
-                @ tracking.keyframe_from_body.mean,
+                reference_from_keyframe[tracking.keyframe_index] @ tracking.keyframe_from_body.mean,
             )
             for tracking in self._trackings
             if tracking.keyframe_index in reference_from_keyframe

@@ -1,8 +1,8 @@
 """Rigid transforms in SE(3) as 4x4 matrices, and Gaussians over them.
 
-A transform `a_from_b` maps points of frame b into frame a; names compose so that the inner ones cancel:
-`a_from_c = a_from_b @ b_from_c`. Tangent vectors are `[rotation, translation]` (GTSAM's order), angles in
-rad and lengths in m; perturbations act on the right: `pose @ exp(xi)`.
+A transform `a_from_b` maps points of frame b into frame a; names compose so that the inner ones
+cancel: `a_from_c = a_from_b @ b_from_c`. Tangent vectors are `[rotation, translation]` (GTSAM's
+order), angles in rad and lengths in m; perturbations act on the right: `pose @ exp(xi)`.
 
 References:
     Blanco et al. 2008, Eq. (10) (product of Gaussians), Eq. (15) (composition).
@@ -171,8 +171,8 @@ def planar_covariance(covariance: FloatArray, *, off_plane_sigma: float = 1e-4) 
 
     Args:
         covariance: Tangent covariance, shape (6, 6).
-        off_plane_sigma: Standard deviation of roll, pitch (rad) and z (m); small, not zero, so that the
-            matrix stays invertible.
+        off_plane_sigma: Standard deviation of roll, pitch (rad) and z (m); small, not zero, so
+            that the matrix stays invertible.
     """
     result = np.zeros((6, 6))
     result[np.ix_(PLANAR_AXES, PLANAR_AXES)] = covariance[np.ix_(PLANAR_AXES, PLANAR_AXES)]

@@ -1,4 +1,4 @@
-"""The metric graph of one hypothesis: a pose per visit, Gaussian arcs between them, globally consistent poses.
+"""The metric graph of one hypothesis: Gaussian arcs between visits, globally consistent poses.
 
 The only module that knows gtsam.
 
@@ -157,9 +157,7 @@ class PoseGraph:
         for factor in self.factors:
             noise = gtsam.noiseModel.Gaussian.Covariance(factor.a_from_b.covariance)
             measured = gtsam.Pose3(factor.a_from_b.mean)
-            graph.add(
-                gtsam.BetweenFactorPose3(factor.visit_a, factor.visit_b, measured, noise)
-            )
+            graph.add(gtsam.BetweenFactorPose3(factor.visit_a, factor.visit_b, measured, noise))
         return graph, values
 
 

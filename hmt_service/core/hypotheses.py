@@ -1,12 +1,12 @@
 """The particle layer: topological hypotheses, each with its own graph and its own probability.
 
-A particle *is* a hypothesis: metric poses are Gaussian inside it (marginalised analytically), so no two particles
-are copies of each other, and resampling is needed only to bound their number.
+A particle *is* a hypothesis: metric poses are Gaussian inside it (marginalised analytically), so no
+two particles are copies of each other, and resampling is needed only to bound their number.
 
 References:
     Blanco et al. 2008, Eq. (6), (12)-(14).
-    Fearnhead and Clifford, On-line inference for hidden Markov models via particle filters, JRSS-B 2003,
-    section 4 (optimal resampling).
+    Fearnhead and Clifford, On-line inference for hidden Markov models via particle filters,
+    JRSS-B 2003, section 4 (optimal resampling).
 """
 
 from __future__ import annotations
@@ -55,9 +55,7 @@ class Hypothesis:
     def topological_path(self) -> tuple[int, ...]:
         """Areas in the order that they were entered."""
         areas = [assignment.area for assignment in self.assignments]
-        return tuple(
-            area for i, area in enumerate(areas) if i == 0 or areas[i - 1] != area
-        )
+        return tuple(area for i, area in enumerate(areas) if i == 0 or areas[i - 1] != area)
 
     @property
     def areas(self) -> tuple[int, ...]:

@@ -1,4 +1,4 @@
-"""Observation model p(z | x, submap): a scan against the ranges that a submap predicts, and the background density.
+"""Observation model p(z | x, submap): a scan against a submap, and the background density.
 
 References:
     Thrun, Burgard, Fox, Probabilistic Robotics, 2005, section 6.3 (beam mixture).
@@ -19,7 +19,7 @@ _BIN_M = 0.25
 
 
 class BackgroundDensity:
-    """p0(z): the density of one range when nothing is known of the place, learned from what was seen."""
+    """p0(z): the learned density of one range when nothing is known of the place."""
 
     def __init__(self, max_range_m: float) -> None:
         """Start uniform, worth one reading per bin.
@@ -113,9 +113,11 @@ class ObservationModel:
 
     def _cells(self, rays: FloatArray) -> np.ndarray:
         azimuth = np.arctan2(rays[:, 1], rays[:, 0]) + np.pi
-        column = np.minimum((azimuth / (2.0 * np.pi) * self._columns).astype(int), self._columns - 1)
+        column = np.minimum(
+            (azimuth / (2.0 * np.pi) * self._columns).astype(int), self._columns - 1
+        )
         if self._is_planar:
-            return column
+            return np.asarray(column)
         elevation = np.arctan2(rays[:, 2], np.hypot(rays[:, 0], rays[:, 1])) + 0.5 * np.pi
         row = np.minimum((elevation / np.pi * self._rows).astype(int), self._rows - 1)
         return np.asarray(row * self._columns + column)

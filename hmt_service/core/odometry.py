@@ -37,15 +37,15 @@ from hmt_service.core.types import (
     TrackingFailure,
 )
 
-# chi-square 99.9 % for 3 and 6 degrees of freedom: beyond it, odometry and scan contradict each other.
+# chi-square 99.9 % for 3 and 6 degrees of freedom: beyond it, odometry and scan contradict.
 _GATE = {3: 16.27, 6: 22.46}
 
 
 class Odometry:
     """Registers scans against a window of recent keyframes.
 
-    Poses are kept relative to the latest keyframe, so that no number grows with the path; the window
-    knows nothing of areas, and never holds a place seen a loop ago.
+    Poses are kept relative to the latest keyframe, so that no number grows with the path; the
+    window knows nothing of areas, and never holds a place seen a loop ago.
     """
 
     def __init__(self, config: Config) -> None:
@@ -59,7 +59,9 @@ class Odometry:
         self._motion = config.motion
         self._covariance = config.covariance
         self._axes = PLANAR_AXES if config.sensor.is_planar else np.arange(6)
-        self._window: deque[tuple[Pose, FloatArray]] = deque(maxlen=config.odometry.window_keyframes)
+        self._window: deque[tuple[Pose, FloatArray]] = deque(
+            maxlen=config.odometry.window_keyframes
+        )
         self._map: RegistrationMap | None = None
         self._keyframes = 0
         self._keyframe_from_body = certain(identity())
@@ -172,11 +174,11 @@ class Odometry:
         return self._fuse(GaussianPose(pose, registered), predicted), None
 
     def _fuse(self, registered: GaussianPose, predicted: GaussianPose) -> GaussianPose:
-        """Return the product of registration and motion prior, the prior widened where they disagree.
+        """Return the product of registration and motion prior, which is widened to agree.
 
-        The prior fills the directions that the scan does not see. Where it contradicts the scan beyond
-        the gate (wheel slip), it is widened until it no longer does, so that it loses its say there and
-        still bounds what nothing else does.
+        The prior fills the directions that the scan does not see. Where it contradicts the scan
+        beyond the gate (wheel slip), it is widened until it no longer does, so that it loses its
+        say there and still bounds what nothing else does.
         """
         block = np.ix_(self._axes, self._axes)
         gap = log(inverse(registered.mean) @ predicted.mean)[self._axes]
@@ -228,9 +230,11 @@ class Odometry:
         )
 
     def _move_window(self, previous_from_body: Pose, points: FloatArray, *, is_lost: bool) -> None:
-        """Express the window in the new keyframe's frame and index it; a lost scan starts a new one."""
+        """Express the window in the new keyframe's frame; a lost scan starts a new one."""
         body_from_previous = inverse(previous_from_body)
-        kept = [] if is_lost else [(body_from_previous @ pose, cloud) for pose, cloud in self._window]
+        kept = (
+            [] if is_lost else [(body_from_previous @ pose, cloud) for pose, cloud in self._window]
+        )
         self._window.clear()
         self._window.extend([*kept, (identity(), points)])
         self._map = RegistrationMap(

@@ -1,7 +1,7 @@
-"""Refinement of a visit that is over: its alignment with its area, and arcs to all that it overlaps.
+"""Refinement of a visit that is over: its place in its area, and arcs to all that it overlaps.
 
-Nothing topological is decided here: a pair of visits is tied only where the hypothesis' own graph already says, with
-little doubt, that they have seen the same space.
+Nothing topological is decided here: a pair of visits is tied only where the hypothesis' own graph
+already says, with little doubt, that they have seen the same space.
 
 References:
     Blanco et al. 2008, section V (local maps are fused once the topology is settled).
@@ -87,11 +87,11 @@ class Refinement:
         return [other for _, _, other in sorted(near)[: self._config.max_neighbours]]
 
     def _is_certain(self, prior: GaussianPose) -> bool:
-        return (
-            np.sqrt(np.linalg.eigvalsh(prior.covariance[3:, 3:])[-1]) <= self._config.max_sigma_m
-            and np.sqrt(np.linalg.eigvalsh(prior.covariance[:3, :3])[-1])
-            <= self._config.max_sigma_rad
+        sigma_rad, sigma_m = (
+            float(np.sqrt(np.linalg.eigvalsh(block)[-1]))
+            for block in (prior.covariance[:3, :3], prior.covariance[3:, 3:])
         )
+        return sigma_m <= self._config.max_sigma_m and sigma_rad <= self._config.max_sigma_rad
 
     @staticmethod
     def _agrees(prior: GaussianPose, mode: Mode) -> bool:

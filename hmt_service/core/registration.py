@@ -1,8 +1,8 @@
-"""Registration of points into a local map: KISS-ICP's parts, with the information that KISS-ICP does not publish.
+"""Registration of points into a local map: KISS-ICP's parts, and the information of a match.
 
 References:
-    Vizzo et al., KISS-ICP, RA-L 2023, sections III-C to III-E (voxel map, robust point-to-point ICP).
-    Censi, An accurate closed-form estimate of ICP's covariance, ICRA 2007 (information of the match).
+    Vizzo et al., KISS-ICP, RA-L 2023, sections III-C to III-E (voxel map, robust ICP).
+    Censi, An accurate closed-form estimate of ICP's covariance, ICRA 2007 (information).
 """
 
 from __future__ import annotations
@@ -51,7 +51,9 @@ def voxel_downsample(points: FloatArray | Points, voxel_m: float) -> FloatArray:
     return np.asarray(kiss_icp_pybind._voxel_down_sample(vectors, voxel_m))
 
 
-def deskew(points: FloatArray, point_times: FloatArray, motion: Pose, max_range_m: float) -> FloatArray:
+def deskew(
+    points: FloatArray, point_times: FloatArray, motion: Pose, max_range_m: float
+) -> FloatArray:
     """Return the points as if all were captured at one time.
 
     Args:
@@ -66,7 +68,7 @@ def deskew(points: FloatArray, point_times: FloatArray, motion: Pose, max_range_
 
 
 class RegistrationMap:
-    """Points to register against: a voxel map for ICP and a KD-tree for what is known of the fit."""
+    """Points to register against: a voxel map for ICP and a KD-tree for the information."""
 
     def __init__(
         self, points: FloatArray | Points, *, voxel_m: float, points_per_voxel: int, is_planar: bool
@@ -121,8 +123,8 @@ class RegistrationMap:
         """
         moved = transform_points(map_from_points, points)
         neighbours = min(_NORMAL_NEIGHBOURS, self._tree.n)
-        distances, indices = self._tree.query(moved, k=neighbours)
-        distances, indices = distances.reshape(len(moved), -1), indices.reshape(len(moved), -1)
+        found = self._tree.query(moved, k=neighbours)
+        distances, indices = (np.asarray(each).reshape(len(moved), -1) for each in found)
         is_inlier = distances[:, 0] <= inlier_m
         share = float(np.mean(is_inlier)) if len(moved) else 0.0
         normals, is_surface = self._normals(indices[is_inlier])
@@ -159,8 +161,8 @@ class RegistrationMap:
 def _without_degenerate_directions(information: FloatArray) -> FloatArray:
     """Return the information without that of translations which almost no surface opposes.
 
-    Along a corridor only clutter and bad normals oppose a translation; what they say is not noise of
-    zero mean, and to average it would make the robot slip with great confidence.
+    Along a corridor only clutter and bad normals oppose a translation; what they say is not noise
+    of zero mean, and to average it would make the robot slip with great confidence.
     """
     values, vectors = np.linalg.eigh(information[3:, 3:])
     seen = vectors[:, values >= _DEGENERATE_SHARE * values[-1]]

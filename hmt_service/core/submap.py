@@ -1,7 +1,8 @@
 """Submaps: what one visit to an area has seen, in the visit's own frame.
 
-A *visit* is one contiguous stay in an area. Visits are facts, cut from the sequence of observations by the area
-abstraction and shared by all hypotheses; which area a visit was to is what hypotheses disagree about.
+A *visit* is one contiguous stay in an area. Visits are facts, cut from the sequence of observations
+by the area abstraction and shared by all hypotheses; which area a visit was to is what hypotheses
+disagree about.
 
 References:
     Blanco et al. 2008, Proposition 1 and Eq. (4) (submaps are independent given the path).
@@ -17,7 +18,14 @@ import numpy as np
 
 from hmt_service.core.area_abstraction import Cells, cells_of
 from hmt_service.core.config import Config
-from hmt_service.core.geometry import FloatArray, GaussianPose, Pose, certain, identity, transform_points
+from hmt_service.core.geometry import (
+    FloatArray,
+    GaussianPose,
+    Pose,
+    certain,
+    identity,
+    transform_points,
+)
 from hmt_service.core.registration import RegistrationMap, voxel_downsample
 from hmt_service.core.types import Keyframe, Points
 
@@ -57,9 +65,7 @@ class Visit:
             transform_points(pose.mean, keyframe.points_in_body)
             for pose, keyframe in zip(self.visit_from_keyframe, self.keyframes, strict=True)
         ]
-        return voxel_downsample(
-            np.concatenate(clouds), 0.5 * self.config.odometry.voxel_size_m
-        )
+        return voxel_downsample(np.concatenate(clouds), 0.5 * self.config.odometry.voxel_size_m)
 
     def points_in(self, frame_from_visit: Pose) -> FloatArray:
         """Return the submap in another frame, shape (N, 3), m."""

@@ -1,8 +1,8 @@
 """The frozen values that flow between the stages; each arrow of the data flow is one of them.
 
-Lengths in m, angles in rad, stamps in s of the sensor's clock. `body` is the robot's centre, `area` the frame of
-an area (the body frame of the keyframe that founded it), `reference` the frame of the area that a global map is
-expressed in.
+Lengths in m, angles in rad, stamps in s of the sensor's clock. `body` is the robot's centre, `area`
+the frame of an area (the body frame of the keyframe that founded it), `reference` the frame of the
+area that a global map is expressed in.
 
 References:
     Blanco et al. 2008, section III and Table I (areas, arcs, HMT pose), section IV-C (global maps).
@@ -35,7 +35,7 @@ class Scan:
     sensor_in_body: FloatArray
     """Position of the sensor, shape (3,), m: where the rays start."""
     point_times: FloatArray | None = None
-    """Capture time of each point as a share of the sweep in [0, 1], shape (N,); None: all at once."""
+    """Capture time of each point as a share of the sweep in [0, 1], shape (N,); None: at once."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
