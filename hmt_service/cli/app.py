@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from hmt_service import __version__
-from hmt_service.cli import control, evaluate, query, replay, serve
+from hmt_service.cli import control, demo, evaluate, query, replay, run, serve
 
 app = typer.Typer(
     name="hmt",
@@ -39,6 +39,8 @@ def _options(
     """Hybrid metric-topological SLAM."""
 
 
+app.command("demo")(demo.demo)
+app.command("run")(run.run)
 app.command("serve")(serve.serve)
 app.command("replay")(replay.replay)
 app.command("status")(query.status)

@@ -48,31 +48,56 @@ def replay(
 ) -> None:
     """Send a recorded log to a daemon, and wait for the map."""
     from rich.console import Console
-    from rich.progress import Progress
 
-    from hmt_service.core.types import Scan
     from hmt_service.io.logs import read_log
     from hmt_service.service.client import HmtClient
 
     console = Console(stderr=True)
     with HmtClient(connect, site=site, robot=robot) as client:
-        before = client.status()
+        client.status()
         with console.status(f"reading {log}"):
             readings = read_log(log, min_range_m=0.0, max_range_m=_FARTHEST_M).readings
-        scans = sum(isinstance(reading, Scan) for reading in readings)
-        with Progress(console=console) as progress:
-            sending = progress.add_task("sending", total=len(readings))
-            for sent, reading in enumerate(_paced(readings, rate)):
-                if sent % _CHECK_EVERY == 0:
-                    _wait_for_room(client)
-                client.publish(reading)
-                progress.advance(sending)
-            if finish:
-                mapping = progress.add_task("mapping", total=scans)
-                known = before.processed_scans
-                _finish(client, lambda n: progress.update(mapping, completed=n - known))
-        after = client.status()
-    _report(console, len(readings), before, after)
+        replay_readings(client, readings, console, rate=rate, has_finish=finish)
+
+
+def replay_readings(
+    client: HmtClient,
+    readings: Sequence[Reading],
+    console: Console,
+    *,
+    rate: float | None = None,
+    has_finish: bool = True,
+) -> None:
+    """Send readings to a daemon with a progress bar, and say what became of them.
+
+    Args:
+        client: Connection to the daemon.
+        readings: In the order of time.
+        console: Where the progress is shown.
+        rate: Speed in multiples of real time; None for full speed.
+        has_finish: Whether to wait for the complete map.
+
+    Raises:
+        DaemonFailure: If a reading did not reach the daemon.
+    """
+    from rich.progress import Progress
+
+    from hmt_service.core.types import Scan
+
+    before = client.status()
+    scans = sum(isinstance(reading, Scan) for reading in readings)
+    with Progress(console=console) as progress:
+        sending = progress.add_task("sending", total=len(readings))
+        for sent, reading in enumerate(_paced(readings, rate)):
+            if sent % _CHECK_EVERY == 0:
+                _wait_for_room(client)
+            client.publish(reading)
+            progress.advance(sending)
+        if has_finish:
+            mapping = progress.add_task("mapping", total=scans)
+            known = before.processed_scans
+            _finish(client, lambda n: progress.update(mapping, completed=n - known))
+    _report(console, len(readings), before, client.status())
 
 
 def _paced(readings: Sequence[Reading], rate: float | None) -> Iterator[Reading]:

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hmt_service.cli.connection import Robot, Site
+from hmt_service.cli.settings import ConfigFile, PresetName, Seed, load_settings
 from hmt_service.core.config import Preset
-from hmt_service.errors import NotFound
 from hmt_service.service.keys import DEFAULT_ENDPOINT, Keys
 
 if TYPE_CHECKING:
@@ -42,11 +42,9 @@ def serve(
     scouting: Annotated[
         bool, typer.Option("--scouting", help="Look for others on the network by multicast.")
     ] = False,
-    preset: Annotated[Preset, typer.Option(help="Kind of sensor.")] = Preset.PLANAR,
-    config: Annotated[
-        Path | None, typer.Option(help="YAML file of settings that differ from the preset.")
-    ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of all randomness.")] = 0,
+    preset: PresetName = Preset.PLANAR,
+    config: ConfigFile = None,
+    seed: Seed = 0,
     out: Annotated[
         Path | None, typer.Option(help="Folder to save the map to; without it nothing is saved.")
     ] = None,
@@ -59,7 +57,6 @@ def serve(
     from rich.console import Console
     from rich.logging import RichHandler
 
-    from hmt_service.core.config import load_config
     from hmt_service.service.daemon import Daemon, DaemonSettings
     from hmt_service.service.results import save_results
     from hmt_service.service.session import Endpoints, Mode
@@ -67,14 +64,14 @@ def serve(
     console = Console(stderr=True)
     handler = RichHandler(console=console, show_path=False)
     logging.basicConfig(level=logging.INFO, format="%(message)s", handlers=[handler])
-    settings = load_config(preset, _read(config))
+    settings = load_settings(preset, config)
     endpoints = Endpoints(
         mode=Mode.PEER,
         listen=tuple(listen or ([] if connect else [DEFAULT_ENDPOINT])),
         connect=tuple(connect or []),
         has_scouting=scouting,
     )
-    save = partial(save_results, directory=out, config=settings) if out is not None else None
+    save = partial(save_results, directory=out, config=settings, seed=seed) if out is not None else None
     daemon = Daemon(
         DaemonSettings(
             keys=Keys(site, robot), endpoints=endpoints, config=settings, seed=seed, save=save
@@ -87,15 +84,6 @@ def serve(
     )
     _print(console, report)
     raise typer.Exit(_exit_code(report, is_saving=save is not None))
-
-
-def _read(config: Path | None) -> str | None:
-    if config is None:
-        return None
-    try:
-        return config.read_text()
-    except OSError as error:
-        raise NotFound(f"configuration {config}: {error.strerror}") from error
 
 
 def _print(console: Console, report: StopReport) -> None:

@@ -10,7 +10,7 @@ from typing import Protocol
 
 from hmt_service.core.types import Reading
 from hmt_service.errors import InvalidLog
-from hmt_service.io.carmen import read_carmen
+from hmt_service.io.carmen import MalformedLine, read_carmen
 
 
 class Log(Protocol):
@@ -23,6 +23,10 @@ class Log(Protocol):
     @property
     def scans(self) -> int:
         """Number of scans among them."""
+
+    @property
+    def malformed(self) -> tuple[MalformedLine, ...]:
+        """What was left out, and why."""
 
 
 class _Reader(Protocol):

@@ -25,7 +25,7 @@ TRAJECTORY, MAP, SUMMARY = "trajectory.tum", "map.hmt", "summary.json"
 
 
 def save_results(
-    engine: Engine, report: RunReport, *, directory: Path, config: Config
+    engine: Engine, report: RunReport, *, directory: Path, config: Config, seed: int
 ) -> tuple[str, ...]:
     """Write trajectory, map and summary, each replaced as a whole.
 
@@ -34,6 +34,7 @@ def save_results(
         report: What it has cost.
         directory: Where to write; made when it does not exist.
         config: Settings that it was built with.
+        seed: Seed that it was built with.
 
     Returns:
         The names of the files.
@@ -50,6 +51,7 @@ def save_results(
     summary = {
         "version": __version__,
         "config_hash": config.hash(),
+        "seed": seed,
         "scans": report.scans,
         "keyframes": snapshot.keyframes,
         "areas": snapshot.areas,

@@ -1,0 +1,123 @@
+"""`hmt demo`: the whole chain on a simulated building, with a real daemon and nothing to download.
+
+References: own.
+"""
+
+from __future__ import annotations
+
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from hmt_service.cli import query
+from hmt_service.cli.replay import replay_readings
+from hmt_service.cli.settings import Seed
+from hmt_service.errors import DaemonFailure
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from rich.console import Console
+
+    from hmt_service.core.types import StampedPose
+
+PICTURE = "map.png"
+"""Name of the figure in the output folder."""
+_START_S = 30.0
+_STOP_S = 10.0
+_POLL_S = 0.05
+
+
+def demo(
+    out: Annotated[Path, typer.Option(help="Folder to write the results to.")] = Path("out/demo"),
+    seed: Seed = 0,
+) -> None:
+    """Simulate a building, send its scans to a daemon over Zenoh, and compare the global maps."""
+    from rich.console import Console
+
+    from hmt_service.service.client import HmtClient
+    from hmt_service.service.results import TRAJECTORY
+    from hmt_service.sim.simulation import simulate
+    from hmt_service.sim.worlds import office
+
+    console = Console()
+    with console.status("simulating an office building"):
+        simulation = simulate(office(seed), seed)
+    console.print(
+        f"simulated {len(simulation.truth)} scans and the wheel odometry of a robot in an office"
+    )
+    endpoint = _free_endpoint()
+    with _daemon(endpoint, out):
+        with HmtClient(endpoint) as client:
+            replay_readings(client, simulation.readings, console)
+        query.posterior(connect=endpoint)
+        query.compare(connect=endpoint)
+        query.map_(connect=endpoint, out=out / PICTURE)
+    _report_truth(console, out / TRAJECTORY, simulation.truth)
+    console.print(f"picture of both maps: {out / PICTURE}", soft_wrap=True)
+
+
+@contextmanager
+def _daemon(endpoint: str, out: Path) -> Iterator[None]:
+    """Run `hmt serve` in a process of its own, and end it.
+
+    Raises:
+        DaemonFailure: If it does not start.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    command = [sys.executable, "-m", "hmt_service", "serve", "--listen", endpoint]
+    with subprocess.Popen([*command, "--out", str(out)]) as process:
+        try:
+            _wait_for(endpoint, process)
+            yield
+        finally:
+            process.terminate()
+            try:
+                process.wait(_STOP_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
+
+
+def _wait_for(endpoint: str, process: subprocess.Popen[bytes]) -> None:
+    host, port = endpoint.removeprefix("tcp/").split(":")
+    deadline_s = time.monotonic() + _START_S
+    while time.monotonic() < deadline_s and process.poll() is None:
+        with socket.socket() as probe:
+            probe.settimeout(_POLL_S)
+            if probe.connect_ex((host, int(port))) == 0:
+                return
+        time.sleep(_POLL_S)
+    raise DaemonFailure(f"hmt serve did not listen on {endpoint} within {_START_S:g} s")
+
+
+def _free_endpoint() -> str:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+def _report_truth(console: Console, trajectory: Path, truth: Sequence[StampedPose]) -> None:
+    """Print how far the map's trajectory is from the simulated one, start poses laid together."""
+    import numpy as np
+
+    from hmt_service.io.trajectory import read_tum
+
+    world_from_reference = truth[0].reference_from_body
+    errors = [
+        np.linalg.norm(
+            (world_from_reference @ pose.reference_from_body)[:3, 3]
+            - true.reference_from_body[:3, 3]
+        )
+        for pose, true in zip(read_tum(trajectory), truth, strict=True)
+    ]
+    console.print(
+        f"distance from the true trajectory, start laid on start: mean {np.mean(errors):.3f} m, "
+        f"largest {np.max(errors):.3f} m over {len(errors)} scans"
+    )

@@ -1,0 +1,115 @@
+"""`hmt run`: a recorded log to a map, offline and reproducible.
+
+References: own.
+"""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from hmt_service.cli.settings import ConfigFile, PresetName, Seed, load_settings
+from hmt_service.core.config import Preset
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from rich.console import Console
+
+    from hmt_service.core.config import Config
+    from hmt_service.core.engine import Engine
+    from hmt_service.core.types import Reading
+    from hmt_service.io.logs import Log
+    from hmt_service.runtime.messages import RunReport
+
+_SHOWN_LINES = 5
+"""Malformed lines that are printed one by one."""
+
+
+def run(
+    log: Annotated[Path, typer.Argument(help="Recorded log.")],
+    out: Annotated[Path, typer.Option(help="Folder to write trajectory, map and summary to.")],
+    preset: PresetName = Preset.PLANAR,
+    config: ConfigFile = None,
+    seed: Seed = 0,
+) -> None:
+    """Build the map of a recorded log; the same log and seed give the same files, bit for bit."""
+    from rich.console import Console
+
+    from hmt_service.io.logs import read_log
+    from hmt_service.service.results import save_results
+
+    console = Console(stderr=True)
+    settings = load_settings(preset, config)
+    with console.status(f"reading {log}"):
+        recorded = read_log(
+            log,
+            min_range_m=settings.sensor.min_range_m,
+            max_range_m=settings.sensor.max_range_m,
+        )
+    _report_reading(console, recorded)
+    engine, report = _map(recorded.readings, recorded.scans, settings, seed, console)
+    files = save_results(engine, report, directory=out, config=settings, seed=seed)
+    _report_map(console, engine, report)
+    console.print(f"saved {', '.join(files)} in {out}", soft_wrap=True)
+
+
+def _map(
+    readings: Sequence[Reading], scans: int, settings: Config, seed: int, console: Console
+) -> tuple[Engine, RunReport]:
+    """Return the finished engine and what it has cost, with a progress bar meanwhile."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+    from rich.progress import TimeRemainingColumn as Remaining
+
+    from hmt_service.core.engine import Engine
+    from hmt_service.core.odometry import Odometry
+    from hmt_service.runtime.messages import RunReport
+
+    odometry, engine = Odometry(settings), Engine(settings, seed=seed)
+    odometry_busy_s = topology_busy_s = 0.0
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), Remaining())
+    with Progress(*columns, console=console) as progress:
+        task = progress.add_task("mapping", total=scans)
+        for reading in readings:
+            started = time.perf_counter()
+            tracking = odometry.process(reading)
+            tracked = time.perf_counter()
+            odometry_busy_s += tracked - started
+            if tracking is None:
+                continue
+            engine.process(tracking)
+            topology_busy_s += time.perf_counter() - tracked
+            progress.advance(task)
+        started = time.perf_counter()
+        engine.finish()
+        topology_busy_s += time.perf_counter() - started
+    return engine, RunReport(scans, odometry_busy_s, topology_busy_s)
+
+
+def _report_reading(console: Console, log: Log) -> None:
+    console.print(f"{log.scans} scans, {len(log.readings) - log.scans} odometry readings")
+    if not log.malformed:
+        return
+    console.print(f"[yellow]{len(log.malformed)} malformed lines left out")
+    for line in log.malformed[:_SHOWN_LINES]:
+        console.print(f"  line {line.line}: {line.reason}", soft_wrap=True, markup=False)
+    if len(log.malformed) > _SHOWN_LINES:
+        numbers = ", ".join(str(line.line) for line in log.malformed[_SHOWN_LINES:])
+        console.print(f"  and lines {numbers}")
+
+
+def _report_map(console: Console, engine: Engine, report: RunReport) -> None:
+    snapshot = engine.snapshot()
+    if snapshot is None:
+        return
+    best = snapshot.posterior.hypotheses[0]
+    busy_s = report.odometry_busy_s + report.topology_busy_s
+    console.print(
+        f"{best.areas} areas, {snapshot.arcs} arcs, {best.loop_closures} loop closures, "
+        f"probability {best.probability:.3f}; {report.scans / busy_s:.0f} scans/s "
+        f"(odometry {report.odometry_busy_s:.1f} s, topology {report.topology_busy_s:.1f} s)",
+        soft_wrap=True,
+    )

@@ -1,0 +1,146 @@
+"""Worlds of straight walls, and what a laser sees in them in closed form."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+
+from hmt_service.core.config import Config, load_config
+from hmt_service.core.geometry import FloatArray, GaussianPose, Pose, certain, inverse, planar_pose
+from hmt_service.core.submap import Visit, visit_of
+from hmt_service.core.types import Keyframe, OdometryReading, Reading, Scan
+
+Walls = FloatArray
+"""Wall segments x0, y0, x1, y1, shape (W, 4), m."""
+
+BEAMS = 240
+BEARINGS = np.linspace(-np.pi, np.pi, BEAMS, endpoint=False)
+
+
+def box(x0: float, y0: float, x1: float, y1: float) -> Walls:
+    corners = [(x0, y0), (x1, y0), (x1, y1), (x0, y1), (x0, y0)]
+    return np.array([[*a, *b] for a, b in pairwise(corners)])
+
+
+SQUARE = box(-4.0, -4.0, 4.0, 4.0)
+"""Looks the same after every quarter turn."""
+ROOM = np.concatenate(
+    [
+        box(-4.0, -3.0, 4.0, 3.0),
+        [[-2.5, 1.5, -1.0, 1.5], [2.0, -3.0, 2.0, -1.5], [1.5, 2.2, 3.2, 1.2]],
+        box(-3.2, -2.2, -2.4, -1.6),
+    ]
+)
+"""Looks like itself from nowhere else and in no other direction."""
+CORRIDOR = np.array([[-200.0, -1.0, 200.0, -1.0], [-200.0, 1.0, 200.0, 1.0]])
+"""No end within the range of the sensor."""
+
+
+def ranges_from(walls: Walls, world_from_body: Pose, bearings_rad: FloatArray) -> FloatArray:
+    """Return the distance to the nearest wall along every bearing; inf where there is none."""
+    angles = np.arctan2(world_from_body[1, 0], world_from_body[0, 0]) + bearings_rad
+    rays = np.stack([np.cos(angles), np.sin(angles)], axis=1)[:, None]
+    starts = walls[:, :2] - world_from_body[:2, 3]
+    along = walls[:, 2:] - walls[:, :2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        determinant = rays[..., 0] * along[:, 1] - rays[..., 1] * along[:, 0]
+        ranges = (starts[:, 0] * along[:, 1] - starts[:, 1] * along[:, 0]) / determinant
+        shares = (starts[:, 0] * rays[..., 1] - starts[:, 1] * rays[..., 0]) / determinant
+    is_hit = (ranges > 0.0) & (shares >= 0.0) & (shares <= 1.0)
+    return np.asarray(np.where(is_hit, ranges, np.inf).min(axis=1))
+
+
+def points_from(
+    walls: Walls, world_from_body: Pose, *, noise_m: FloatArray | float = 0.0
+) -> FloatArray:
+    """Return what the laser at the robot's centre sees, in the body frame, shape (N, 3), m."""
+    ranges = ranges_from(walls, world_from_body, BEARINGS)
+    directions = np.stack([np.cos(BEARINGS), np.sin(BEARINGS), np.zeros(BEAMS)], axis=1)
+    points = (ranges + noise_m)[:, None] * directions
+    return np.asarray(points[ranges < 30.0])
+
+
+def cloud_of(walls: Walls, *, spacing_m: float = 0.05) -> FloatArray:
+    """Return points along all walls, shape (N, 3), m."""
+    clouds = []
+    for x0, y0, x1, y1 in walls:
+        count = int(np.hypot(x1 - x0, y1 - y0) / spacing_m) + 1
+        share = (np.arange(count) + 0.5) / count
+        clouds.append(
+            np.stack([x0 + share * (x1 - x0), y0 + share * (y1 - y0), 0.0 * share], axis=1)
+        )
+    return np.concatenate(clouds)
+
+
+def motion_covariance(sigma_rad: float, sigma_m: float) -> FloatArray:
+    return np.diag([1e-8, 1e-8, sigma_rad**2, sigma_m**2, sigma_m**2, 1e-8])
+
+
+def gaussian(mean: Pose, *, sigma_rad: float = 0.01, sigma_m: float = 0.05) -> GaussianPose:
+    """Return a planar pose with the same uncertainty along both axes."""
+    return GaussianPose(mean, motion_covariance(sigma_rad, sigma_m))
+
+
+def keyframes_along(
+    walls: Walls, path: Sequence[Pose], *, first: int = 0, noise: np.random.Generator | None = None
+) -> tuple[Keyframe, ...]:
+    """Return a keyframe at every pose, with the true motion between them."""
+    result = []
+    for index, pose in enumerate(path):
+        error_m = noise.normal(0.0, 0.01, BEAMS) if noise is not None else 0.0
+        motion = certain(pose) if index == 0 else gaussian(inverse(path[index - 1]) @ pose)
+        result.append(
+            Keyframe(
+                index=first + index,
+                stamp_s=float(first + index),
+                points_in_body=points_from(walls, pose, noise_m=error_m).astype(np.float32),
+                sensor_in_body=np.zeros(3),
+                previous_from_body=motion,
+            )
+        )
+    return tuple(result)
+
+
+def visit_along(
+    walls: Walls, path: Sequence[Pose], *, visit: int = 0, config: Config | None = None
+) -> Visit:
+    return visit_of(visit, keyframes_along(walls, path), config or load_config())
+
+
+def line(start: Pose, *, length_m: float, step_m: float = 0.5) -> list[Pose]:
+    """Return poses straight ahead from `start`, both ends included."""
+    steps = round(length_m / step_m)
+    return [start @ planar_pose(i * step_m, 0.0, 0.0) for i in range(steps + 1)]
+
+
+def drive(
+    walls: Walls,
+    path: Sequence[Pose],
+    *,
+    odometry: Sequence[Pose] | None = None,
+    noise: np.random.Generator | None = None,
+    period_s: float = 0.1,
+) -> list[Reading]:
+    """Return a scan at every pose, each after what the wheels say of it, if they say anything."""
+    result: list[Reading] = []
+    for index, pose in enumerate(path):
+        stamp_s = 100.0 + index * period_s
+        if odometry is not None:
+            result.append(OdometryReading(stamp_s, odometry[index]))
+        error_m = noise.normal(0.0, 0.01, BEAMS) if noise is not None else 0.0
+        result.append(Scan(stamp_s, points_from(walls, pose, noise_m=error_m), np.zeros(3)))
+    return result
+
+
+def drifting(path: Sequence[Pose], *, scale: float, turn_rad_per_m: float) -> list[Pose]:
+    """Return what wheels of the wrong size say of a path."""
+    result = [np.eye(4)]
+    for before, now in pairwise(path):
+        step = inverse(before) @ now
+        travelled_m = float(np.linalg.norm(step[:3, 3]))
+        wrong = step @ planar_pose(0.0, 0.0, turn_rad_per_m * travelled_m)
+        wrong[:2, 3] *= scale
+        result.append(result[-1] @ wrong)
+    return result
