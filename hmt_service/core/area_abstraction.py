@@ -50,9 +50,11 @@ def overlap_of(cells: Sequence[Cells]) -> FloatArray:
     All pairs at once: with the sparse keyframe-by-cell matrix B, the shared cells are `B @ B.T`.
     """
     sizes = np.array([len(own) for own in cells])
-    _, columns = np.unique(np.concatenate(cells), return_inverse=True)
+    known, columns = np.unique(np.concatenate(cells), return_inverse=True)
     rows = np.repeat(np.arange(len(cells)), sizes)
-    membership = csr_array((np.ones(len(columns)), (rows, columns.ravel())))
+    membership = csr_array(
+        (np.ones(len(columns)), (rows, columns.ravel())), shape=(len(cells), len(known))
+    )
     shared = (membership @ membership.T).toarray()
     sizes = np.maximum(sizes, 1)
     return np.asarray(0.5 * (shared / sizes[:, None] + shared / sizes[None, :]))
