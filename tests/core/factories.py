@@ -44,7 +44,7 @@ def ranges_from(walls: Walls, world_from_body: Pose, bearings_rad: FloatArray) -
     rays = np.stack([np.cos(angles), np.sin(angles)], axis=1)[:, None]
     starts = walls[:, :2] - world_from_body[:2, 3]
     along = walls[:, 2:] - walls[:, :2]
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         determinant = rays[..., 0] * along[:, 1] - rays[..., 1] * along[:, 0]
         ranges = (starts[:, 0] * along[:, 1] - starts[:, 1] * along[:, 0]) / determinant
         shares = (starts[:, 0] * rays[..., 1] - starts[:, 1] * rays[..., 0]) / determinant
@@ -56,10 +56,10 @@ def points_from(
     walls: Walls, world_from_body: Pose, *, noise_m: FloatArray | float = 0.0
 ) -> FloatArray:
     """Return what the laser at the robot's centre sees, in the body frame, shape (N, 3), m."""
-    ranges = ranges_from(walls, world_from_body, BEARINGS)
+    ranges = ranges_from(walls, world_from_body, BEARINGS) + noise_m
+    is_return = ranges < 30.0
     directions = np.stack([np.cos(BEARINGS), np.sin(BEARINGS), np.zeros(BEAMS)], axis=1)
-    points = (ranges + noise_m)[:, None] * directions
-    return np.asarray(points[ranges < 30.0])
+    return np.asarray(ranges[is_return, None] * directions[is_return])
 
 
 def cloud_of(walls: Walls, *, spacing_m: float = 0.05) -> FloatArray:

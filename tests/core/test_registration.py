@@ -39,9 +39,9 @@ ROOM_MAP = map_of(cloud_of(ROOM))
 
 
 @given(
-    x=st.floats(-0.25, 0.25),
-    y=st.floats(-0.25, 0.25),
-    yaw=st.floats(-0.1, 0.1),
+    x=st.floats(-0.1, 0.1),
+    y=st.floats(-0.1, 0.1),
+    yaw=st.floats(-0.05, 0.05),
     start=st.sampled_from([(0.0, 0.0, 0.0), (-1.0, 0.5, 1.2), (1.0, -0.5, -2.5)]),
 )
 @settings(max_examples=30, deadline=None)

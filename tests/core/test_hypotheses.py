@@ -1,0 +1,195 @@
+"""The particle layer: weights, their number, and resampling that is not biased."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hmt_service.core.geometry import FloatArray, identity, planar_pose
+from hmt_service.core.graph import Factor, PoseGraph
+from hmt_service.core.hypotheses import (
+    Assignment,
+    Hypothesis,
+    ParticleLayer,
+    optimal_resampling,
+)
+from tests.core.factories import gaussian
+
+
+def hypothesis_of(identifier: int, weight: float) -> Hypothesis:
+    graph = PoseGraph(is_planar=True)
+    graph.add_reference(0)
+    return Hypothesis(identifier, math.log(weight), (Assignment(0, 0, None),), graph)
+
+
+def layer_of(
+    *weights: float, budget: int = 15, negligible_mass: float = 1e-6, seed: int = 0
+) -> ParticleLayer:
+    layer = ParticleLayer(
+        budget=budget, negligible_mass=negligible_mass, rng=np.random.default_rng(seed)
+    )
+    layer.replace([hypothesis_of(i, weight) for i, weight in enumerate(weights)])
+    return layer
+
+
+def weights_strategy(*, min_size: int = 3) -> st.SearchStrategy[FloatArray]:
+    return (
+        st.lists(st.floats(-12.0, 0.0), min_size=min_size, max_size=30)
+        .map(lambda logs: np.exp(np.array(logs)))
+        .map(lambda weights: weights / weights.sum())
+    )
+
+
+@given(weights=weights_strategy(), scale=st.floats(-300.0, 300.0), budget=st.integers(1, 10))
+def test_weights_sum_to_one_in_falling_order(
+    weights: FloatArray, scale: float, budget: int
+) -> None:
+    layer = ParticleLayer(budget=budget, negligible_mass=1e-9, rng=np.random.default_rng(1))
+    layer.replace(
+        [
+            replace(hypothesis_of(i, 1.0), log_weight=math.log(weight) + scale)
+            for i, weight in enumerate(weights)
+        ]
+    )
+    probabilities = layer.probabilities
+    assert len(probabilities) <= budget
+    assert probabilities.sum() == pytest.approx(1.0)
+    assert np.all(np.diff(probabilities) <= 0.0)
+    assert 1.0 <= layer.effective_sample_size <= len(probabilities) + 1e-9
+    assert layer.best is layer.hypotheses[0]
+    assert [s.probability for s in layer.summaries()] == probabilities.tolist()
+
+
+@pytest.mark.parametrize(
+    ("weights", "expected"),
+    [((1.0,), 1.0), ((2.0, 2.0, 2.0, 2.0), 4.0), ((0.5, 0.25, 0.25), 8 / 3)],
+)
+def test_effective_sample_size_has_known_values(
+    weights: tuple[float, ...], expected: float
+) -> None:
+    assert layer_of(*weights).effective_sample_size == pytest.approx(expected)
+
+
+def test_reweighting_is_bayes_rule() -> None:
+    layer = layer_of(0.5, 0.3, 0.2)
+    likelihood = {0: 0.1, 1: 0.4, 2: 0.2}
+    layer.reweight(lambda h: math.log(likelihood[h.hypothesis]) - 1000.0)
+    assert [h.hypothesis for h in layer.hypotheses] == [1, 0, 2]
+    assert layer.probabilities == pytest.approx(np.array([0.12, 0.05, 0.04]) / 0.21)
+
+
+def test_negligible_hypotheses_are_dropped_and_reported() -> None:
+    layer = layer_of(0.6, 0.4, negligible_mass=1e-3)
+    dropped = layer.replace(
+        [hypothesis_of(0, 0.6), hypothesis_of(1, 0.4), hypothesis_of(2, 0.9e-3)]
+    )
+    assert [h.hypothesis for h in dropped] == [2]
+    assert math.exp(dropped[0].log_weight) == pytest.approx(0.9e-3 / 1.0009)
+    assert layer.probabilities == pytest.approx([0.6, 0.4])
+    assert not layer.replace([hypothesis_of(0, 0.6), hypothesis_of(1, 1.1e-3)])
+
+
+def test_budget_is_kept_and_what_is_lost_is_reported() -> None:
+    layer = layer_of(1.0, budget=3)
+    dropped = layer.replace([hypothesis_of(i, 1.0) for i in range(8)])
+    assert len(layer.hypotheses) == 3
+    assert sorted([h.hypothesis for h in layer.hypotheses] + [h.hypothesis for h in dropped]) == (
+        list(range(8))
+    )
+    assert layer.probabilities == pytest.approx(np.full(3, 1 / 3))
+
+
+@given(weights=weights_strategy(min_size=6), budget=st.integers(1, 5), seed=st.integers(0, 999))
+def test_resampling_keeps_the_budget_and_the_heavy_ones_exactly(
+    weights: FloatArray, budget: int, seed: int
+) -> None:
+    survivors = optimal_resampling(weights, budget, np.random.default_rng(seed))
+    indices = [i for i, _ in survivors]
+    assert len(set(indices)) == len(survivors) == budget
+    assert indices == sorted(indices)
+    assert sum(weight for _, weight in survivors) == pytest.approx(1.0)
+    lightest = min(weight for _, weight in survivors)
+    for i, weight in survivors:
+        assert weight == pytest.approx(max(weights[i], lightest))
+    # Whatever was lost is not heavier than what any survivor of the lottery now weighs.
+    lost = [float(weights[i]) for i in range(len(weights)) if i not in indices]
+    assert max(lost) <= lightest * (1.0 + 1e-9)
+
+
+def test_threshold_has_a_known_value() -> None:
+    # sum(min(w / k, 1)) = 2 for k = 0.4: only the first is heavier, the rest are worth 0.4 / 0.4.
+    weights = np.array([0.6, 0.2, 0.1, 0.1])
+    for seed in range(20):
+        survivors = dict(optimal_resampling(weights, 2, np.random.default_rng(seed)))
+        assert survivors.pop(0) == 0.6
+        assert list(survivors.values()) == pytest.approx([0.4])
+
+
+def test_resampling_is_unbiased() -> None:
+    weights = np.array([0.4, 0.15, 0.12, 0.1, 0.08, 0.06, 0.05, 0.04])
+    runs, rng = 4000, np.random.default_rng(7)
+    mean = np.zeros(len(weights))
+    for _ in range(runs):
+        for i, weight in optimal_resampling(weights, 4, rng):
+            mean[i] += weight / runs
+    # A light one of weight w survives with probability w / 0.2 as 0.2: deviation of the mean below
+    # sqrt(0.2 * 0.2 / 4 / 4000) = 0.0016; five of them.
+    assert mean == pytest.approx(weights, abs=0.008)
+    assert mean[0] == pytest.approx(0.4, abs=1e-12)
+
+
+def test_same_seed_gives_the_same_survivors() -> None:
+    weights = np.full(40, 1 / 40)
+    runs = [optimal_resampling(weights, 15, np.random.default_rng(3)) for _ in range(2)]
+    assert runs[0] == runs[1]
+    assert runs[0] != optimal_resampling(weights, 15, np.random.default_rng(4))
+
+
+def travelled() -> Hypothesis:
+    """Return a hypothesis that went 0, 1, and back to 0."""
+    step = gaussian(planar_pose(5.0, 0.0, 0.0))
+    hypothesis = hypothesis_of(0, 1.0).extended(
+        Assignment(1, 1, None), Factor(0, 1, step), hypothesis=1, log_weight=-1.0
+    )
+    return hypothesis.extended(
+        Assignment(2, 0, gaussian(planar_pose(0.4, 0.0, 0.0))),
+        Factor(1, 2, gaussian(planar_pose(-5.0, 0.0, 0.0))),
+        hypothesis=2,
+        log_weight=-2.0,
+    )
+
+
+def test_loop_closure_is_counted_and_ties_the_graph() -> None:
+    hypothesis = travelled()
+    assert hypothesis.topological_path == (0, 1, 0)
+    assert hypothesis.areas == (0, 1)
+    assert hypothesis.visits_to(0) == (0, 2)
+    assert [(f.visit_a, f.visit_b) for f in hypothesis.graph.factors] == [(0, 1), (0, 2), (1, 2)]
+    layer = ParticleLayer(budget=2, negligible_mass=1e-6, rng=np.random.default_rng(0))
+    layer.replace([hypothesis])
+    (summary,) = layer.summaries()
+    assert (summary.areas, summary.loop_closures, summary.current_area) == (2, 1, 0)
+    # The chain says 0 m with variance 2, the alignment 0.4 m with variance 1.
+    assert hypothesis.area_from_visit(2).mean[0, 3] == pytest.approx(0.4 * 2 / 3, abs=1e-3)
+    assert hypothesis.area_from_visit(1).mean == pytest.approx(identity())
+    assert not hypothesis.area_from_visit(1).covariance.any()
+
+
+def test_successors_leave_their_parent_as_it_was() -> None:
+    parent = travelled()
+    before = [parent.graph.pose(visit).tolist() for visit in parent.graph.visits]
+    arc = Factor(2, 3, gaussian(planar_pose(5.0, 0.0, 0.0)))
+    new = parent.extended(Assignment(3, 3, None), arc, hypothesis=3, log_weight=0.0)
+    known = parent.extended(
+        Assignment(3, 1, gaussian(planar_pose(0.5, 0.0, 0.0))), arc, hypothesis=4, log_weight=0.0
+    )
+    assert new.graph is not known.graph
+    assert new.graph.pose(3)[0, 3] != pytest.approx(known.graph.pose(3)[0, 3], abs=0.01)
+    assert parent.graph.visits == (0, 1, 2)
+    assert [parent.graph.pose(visit).tolist() for visit in parent.graph.visits] == before
+    assert (new.areas, known.areas) == ((0, 1, 3), (0, 1))
