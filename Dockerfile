@@ -21,4 +21,4 @@ VOLUME /data
 EXPOSE 7447
 HEALTHCHECK --interval=10s --timeout=5s --start-period=20s CMD ["hmt", "status", "--json"]
 ENTRYPOINT ["hmt"]
-CMD ["serve"]
+CMD ["serve", "--listen", "tcp/0.0.0.0:7447", "--out", "/data/map"]

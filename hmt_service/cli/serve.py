@@ -71,7 +71,9 @@ def serve(
         connect=tuple(connect or []),
         has_scouting=scouting,
     )
-    save = partial(save_results, directory=out, config=settings, seed=seed) if out is not None else None
+    save = None
+    if out is not None:
+        save = partial(save_results, directory=out, config=settings, seed=seed)
     daemon = Daemon(
         DaemonSettings(
             keys=Keys(site, robot), endpoints=endpoints, config=settings, seed=seed, save=save
