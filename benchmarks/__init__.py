@@ -1,1 +1,1 @@
-"""Benchmarks: measured numbers of the whole chain, each with a unit and a direction."""
+"""Benchmarks of the whole chain: numbers with a unit and a direction, and their gate."""

@@ -1,0 +1,95 @@
+"""The whole chain in one process, and what each stage costs: what `hmt run` does between its files.
+
+References: own.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from hmt_service.core.config import Config
+from hmt_service.core.engine import Engine
+from hmt_service.core.odometry import Odometry
+from hmt_service.core.types import Reading, Scan
+from hmt_service.io.logs import read_log
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mapped:
+    """A finished map and the wall-clock time that it has cost."""
+
+    engine: Engine
+    """The map."""
+    scans: int
+    """Number of scans in it."""
+    odometry_s: float
+    """Time in the odometry."""
+    topology_s: float
+    """Time in the engine, the end of the map included."""
+
+    @property
+    def total_s(self) -> float:
+        """Time of both stages."""
+        return self.odometry_s + self.topology_s
+
+
+def map_readings(readings: Iterable[Reading], config: Config) -> Mapped:
+    """Build the map of readings in the order of time."""
+    odometry, engine = Odometry(config), Engine(config)
+    scans, odometry_s, topology_s = 0, 0.0, 0.0
+    for reading in readings:
+        started = time.perf_counter()
+        tracking = odometry.process(reading)
+        tracked = time.perf_counter()
+        odometry_s += tracked - started
+        if tracking is None:
+            continue
+        engine.process(tracking)
+        topology_s += time.perf_counter() - tracked
+        scans += 1
+    started = time.perf_counter()
+    engine.finish()
+    topology_s += time.perf_counter() - started
+    return Mapped(engine, scans, odometry_s, topology_s)
+
+
+def first_scans(readings: Sequence[Reading], scans: int | None) -> tuple[Reading, ...]:
+    """Return the readings up to and including scan number `scans`; all of them for None."""
+    return tuple(readings) if scans is None else tuple(_until(readings, scans))
+
+
+def _until(readings: Iterable[Reading], scans: int) -> Iterator[Reading]:
+    for reading in readings:
+        yield reading
+        scans -= isinstance(reading, Scan)
+        if scans <= 0:
+            return
+
+
+@dataclass(frozen=True, slots=True)
+class Missing:
+    """A recorded file that cannot be used."""
+
+    reason: str
+    """Why not, for a person; names no folder of this machine."""
+
+
+def recorded_file(name: str) -> Path | Missing:
+    """Return a file below `HMT_DATA/2d`, or why there is none."""
+    folder = os.environ.get("HMT_DATA")
+    if not folder:
+        return Missing("HMT_DATA does not name the folder of recorded logs")
+    path = Path(folder) / "2d" / name
+    if not path.is_file():
+        return Missing(f"no file 2d/{name} in the folder that HMT_DATA names")
+    return path
+
+
+def read_recorded(path: Path, config: Config) -> tuple[Reading, ...]:
+    """Return the readings of a recorded log as `hmt run` sees them."""
+    sensor = config.sensor
+    return read_log(path, min_range_m=sensor.min_range_m, max_range_m=sensor.max_range_m).readings
