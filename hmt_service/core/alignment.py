@@ -140,6 +140,11 @@ class Aligner:
         ) ** 2 <= reach_m**2
         if not np.any(is_inside):
             return []
+        # Only the window around the search region is kept: a full circle would not fit otherwise.
+        window = tuple(
+            slice(int(hit[0]), int(hit[-1]) + 1)
+            for hit in (np.flatnonzero(is_inside.any(axis=axis)) for axis in (1, 0))
+        )
         scores = []
         for turn in turns:
             yaw = yaw_of(prior.mean) + turn
@@ -150,8 +155,10 @@ class Aligner:
             score = fft.irfft2(spectrum * np.conj(fft.rfft2(stamp)), shape)
             # Index k stands for a shift by k cells, wrapped; row 0 of `rows` is shift -extent.
             score = np.roll(score, (extent, extent), axis=(0, 1))
-            scores.append(np.where(is_inside, score, 0.0).astype(np.float32))
-        return self._peaks(np.stack(scores), turns, rows, columns, visit, prior)
+            scores.append(np.where(is_inside, score, 0.0)[window].astype(np.float32))
+        return self._peaks(
+            np.stack(scores), turns, rows[window[0]], columns[window[1]], visit, prior
+        )
 
     def _peaks(
         self,

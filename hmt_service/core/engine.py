@@ -48,6 +48,7 @@ from hmt_service.core.types import (
     Snapshot,
     StampedPose,
     Tracking,
+    TrackingFailure,
 )
 from hmt_service.errors import NotFound, Unavailable
 
@@ -76,7 +77,7 @@ class Engine:
         )
         self._visits: dict[int, Visit] = {}
         self._motions: list[Factor] = []
-        self._trackings: list[Tracking] = []
+        self._scans: list[StoredScan] = []
         self._next_hypothesis = 0
         self._revision = 0
 
@@ -91,7 +92,8 @@ class Engine:
         Returns:
             What was decided because of it.
         """
-        self._trackings.append(tracking)
+        pose = tracking.keyframe_from_body.mean
+        self._scans.append(StoredScan(tracking.stamp_s, tracking.keyframe_index, pose))
         keyframe = tracking.keyframe
         if keyframe is None:
             return ()
@@ -101,7 +103,9 @@ class Engine:
             return self._begin(keyframe)
         events: tuple[Event, ...] = ()
         if keyframe.failure is not None:
-            return self._enter(self._open.with_keyframe(keyframe), len(self._open.keyframes))
+            lost = _lost(keyframe, keyframe.failure)
+            border = len(self._open.keyframes)
+            return (lost, *self._enter(self._open.with_keyframe(keyframe), border))
         self._visits[self._open.visit] = self._open.with_keyframe(keyframe)  # metric SLAM
         events += self._weigh(keyframe)  # Eq. (12)
         areas = self._config.areas
@@ -358,11 +362,11 @@ class Engine:
                 reference_from_keyframe[keyframe.index] = reference_from_visit @ pose.mean
         return tuple(
             StampedPose(
-                tracking.stamp_s,
-                reference_from_keyframe[tracking.keyframe_index] @ tracking.keyframe_from_body.mean,
+                scan.stamp_s,
+                reference_from_keyframe[scan.keyframe_index] @ scan.keyframe_from_body,
             )
-            for tracking in self._trackings
-            if tracking.keyframe_index in reference_from_keyframe
+            for scan in self._scans
+            if scan.keyframe_index in reference_from_keyframe
         )
 
     def stored(self) -> StoredMap:
@@ -377,10 +381,7 @@ class Engine:
                 for visit in self._visits.values()
             ),
             hypotheses=tuple(_stored(h) for h in self._particles.hypotheses),
-            scans=tuple(
-                StoredScan(t.stamp_s, t.keyframe_index, t.keyframe_from_body.mean)
-                for t in self._trackings
-            ),
+            scans=tuple(self._scans),
         )
 
     def _choose(self, hypothesis: int | None) -> tuple[Hypothesis, float]:
@@ -414,6 +415,17 @@ class Engine:
 
 
 _NO_POINTS: Points = np.zeros((0, 3), dtype=np.float32)
+
+
+def _lost(keyframe: Keyframe, failure: TrackingFailure) -> Event:
+    covariance = keyframe.previous_from_body.covariance
+    numbers = {
+        "keyframe": float(keyframe.index),
+        "sigma_m": float(np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1])),
+        "sigma_rad": float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])),
+    }
+    message = f"keyframe {keyframe.index} was not registered ({failure}): a new area begins"
+    return Event(EventKind.LOST, keyframe.stamp_s, message, numbers)
 
 
 def _assignment(visit: int, successor: Successor) -> Assignment:

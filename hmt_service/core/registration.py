@@ -155,7 +155,8 @@ class RegistrationMap:
         values, vectors = np.linalg.eigh(scatter)
         normals = np.zeros((len(indices), 3))
         normals[:, : vectors.shape[1]] = vectors[..., 0]
-        return normals, values[:, 0] <= _MAX_FLATNESS**2 * values[:, 1]
+        is_surface = (values[:, 0] <= _MAX_FLATNESS**2 * values[:, 1]) & (values[:, 1] > 0.0)
+        return normals, is_surface
 
 
 def _without_degenerate_directions(information: FloatArray) -> FloatArray:
