@@ -13,19 +13,15 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.chain import (
-    Mapped,
-    Missing,
-    first_scans,
-    map_readings,
-    read_recorded,
-    recorded_file,
-)
 from benchmarks.metric import Direction, Metric
+from benchmarks.recordings import Missing, first_scans, read_recorded, recorded_file
 from benchmarks.report import Report, Run
 from hmt_service.core.config import load_config
+from hmt_service.core.engine import Engine
 from hmt_service.core.types import StampedPose
 from hmt_service.io.relations import ErrorStatistics, Relations, evaluate, read_relations
+from hmt_service.runtime.messages import RunReport
+from hmt_service.runtime.offline import map_readings
 
 _LOGS = ("intel", "fr079", "aces")
 _QUICK_SCANS = 2_000
@@ -65,14 +61,15 @@ def _measure_log(run: Run, name: str, path: Path, relations: Relations) -> Repor
     read_s = time.perf_counter() - started
     readings = first_scans(recorded, _QUICK_SCANS if run.is_quick else None)
     run.say(f"{name}: mapping")
-    mapped = map_readings(readings, config)
-    trajectory = mapped.engine.trajectory()
-    metrics = list(_costs(name, mapped, read_s, readings[-1].stamp_s - readings[0].stamp_s))
+    engine, cost = map_readings(readings, config)
+    trajectory = engine.trajectory()
+    recorded_s = readings[-1].stamp_s - readings[0].stamp_s
+    metrics = list(_costs(name, engine, cost, read_s=read_s, recorded_s=recorded_s))
     skipped = []
     for group, (above_s, below_s) in _GROUPS.items():
         covered = _covered(relations, trajectory, above_s, below_s)
         if not len(covered.stamps_s):
-            skipped.append(f"{name}/{group}: {mapped.scans} scans cover none of these relations")
+            skipped.append(f"{name}/{group}: {cost.scans} scans cover none of these relations")
             continue
         errors = evaluate(trajectory, covered, tolerance_s=_TOLERANCE_S)
         matched = float(errors.matched)
@@ -106,8 +103,10 @@ def _errors(prefix: str, errors: ErrorStatistics) -> Iterator[Metric]:
         yield Metric(f"{prefix}/{name}", value, unit, _LOWER, tolerance)
 
 
-def _costs(name: str, mapped: Mapped, read_s: float, recorded_s: float) -> Iterator[Metric]:
-    snapshot = mapped.engine.snapshot()
+def _costs(
+    name: str, engine: Engine, cost: RunReport, *, read_s: float, recorded_s: float
+) -> Iterator[Metric]:
+    snapshot = engine.snapshot()
     if snapshot is not None:
         best = snapshot.posterior.hypotheses[0]
         loops = float(best.loop_closures)
@@ -115,11 +114,11 @@ def _costs(name: str, mapped: Mapped, read_s: float, recorded_s: float) -> Itera
         yield Metric(f"{name}/loop_closures", loops, "1", _HIGHER, _LOOPS_TOLERANCE)
     for stage, seconds in (
         ("read", read_s),
-        ("odometry", mapped.odometry_s),
-        ("topology", mapped.topology_s),
+        ("odometry", cost.odometry_busy_s),
+        ("topology", cost.topology_busy_s),
     ):
         yield Metric(f"{name}/{stage}_time", seconds, "s", _LOWER, None)
-    share = mapped.topology_s / mapped.odometry_s
+    share = cost.topology_busy_s / cost.odometry_busy_s
     yield Metric(f"{name}/topology_over_odometry", share, "1", _LOWER, _TIME_TOLERANCE)
-    speed = recorded_s / mapped.total_s  # scans/s of the chain over scans/s of the recording
+    speed = recorded_s / cost.busy_s  # scans/s of the chain over scans/s of the recording
     yield Metric(f"{name}/real_time_factor", speed, "1", _HIGHER, _TIME_TOLERANCE)

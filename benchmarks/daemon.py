@@ -18,12 +18,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from benchmarks.chain import Missing, first_scans, map_readings, read_recorded, recorded_file
 from benchmarks.metric import Direction, Metric
+from benchmarks.recordings import Missing, first_scans, read_recorded, recorded_file
 from benchmarks.report import Report, Run
 from hmt_service.core.config import Config, load_config
 from hmt_service.core.types import Reading, Scan
 from hmt_service.errors import DaemonFailure, Unavailable
+from hmt_service.runtime.offline import map_readings
 from hmt_service.service.client import HmtClient
 from hmt_service.service.reports import DaemonState
 
@@ -57,12 +58,12 @@ def measure(run: Run) -> Report:
     scans = sum(isinstance(reading, Scan) for reading in readings)
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as sender:
         run.say(f"{source}: one process, before")
-        before_s = map_readings(readings, config).total_s
+        before_s = map_readings(readings, config)[1].busy_s
         run.say(f"{source}: daemon")
         with _serving() as endpoint:
             sent = sender.submit(_send, endpoint, readings).result()
         run.say(f"{source}: one process, after")
-        after_s = map_readings(readings, config).total_s
+        after_s = map_readings(readings, config)[1].busy_s
         run.say(f"{source}: daemon with queries")
         with _serving() as endpoint, HmtClient(endpoint) as client:
             sending = sender.submit(_send, endpoint, readings)

@@ -5,7 +5,6 @@ References: own.
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -64,29 +63,12 @@ def _map(
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
     from rich.progress import TimeRemainingColumn as Remaining
 
-    from hmt_service.core.engine import Engine
-    from hmt_service.core.odometry import Odometry
-    from hmt_service.runtime.messages import RunReport
+    from hmt_service.runtime.offline import map_readings
 
-    odometry, engine = Odometry(settings), Engine(settings, seed=seed)
-    odometry_busy_s = topology_busy_s = 0.0
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), Remaining())
     with Progress(*columns, console=console) as progress:
         task = progress.add_task("mapping", total=scans)
-        for reading in readings:
-            started = time.perf_counter()
-            tracking = odometry.process(reading)
-            tracked = time.perf_counter()
-            odometry_busy_s += tracked - started
-            if tracking is None:
-                continue
-            engine.process(tracking)
-            topology_busy_s += time.perf_counter() - tracked
-            progress.advance(task)
-        started = time.perf_counter()
-        engine.finish()
-        topology_busy_s += time.perf_counter() - started
-    return engine, RunReport(scans, odometry_busy_s, topology_busy_s)
+        return map_readings(readings, settings, seed=seed, on_scan=lambda: progress.advance(task))
 
 
 def _report_reading(console: Console, log: Log) -> None:
@@ -106,10 +88,9 @@ def _report_map(console: Console, engine: Engine, report: RunReport) -> None:
     if snapshot is None:
         return
     best = snapshot.posterior.hypotheses[0]
-    busy_s = report.odometry_busy_s + report.topology_busy_s
     console.print(
         f"{best.areas} areas, {snapshot.arcs} arcs, {best.loop_closures} loop closures, "
-        f"probability {best.probability:.3f}; {report.scans / busy_s:.0f} scans/s "
+        f"probability {best.probability:.3f}; {report.scans / report.busy_s:.0f} scans/s "
         f"(odometry {report.odometry_busy_s:.1f} s, topology {report.topology_busy_s:.1f} s)",
         soft_wrap=True,
     )

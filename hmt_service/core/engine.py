@@ -80,6 +80,7 @@ class Engine:
         self._scans: list[StoredScan] = []
         self._next_hypothesis = 0
         self._revision = 0
+        self._finished_revision = 0
 
     # ------------------------------------------------------------------ from scans to hypotheses
 
@@ -117,14 +118,15 @@ class Engine:
         return events
 
     def finish(self) -> tuple[Event, ...]:
-        """Refine what the last visit says; more trackings may follow.
+        """Refine what the last visit says; more trackings may follow, and twice is as good as once.
 
         Returns:
             What was decided.
         """
-        if self._visits:
+        if self._revision > self._finished_revision:
             self._refine(self._open)
             self._revision += 1
+            self._finished_revision = self._revision
         return ()
 
     @property

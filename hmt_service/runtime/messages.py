@@ -81,6 +81,11 @@ class RunReport:
     topology_busy_s: float
     """Time that the topology has worked, s of the wall clock."""
 
+    @property
+    def busy_s(self) -> float:
+        """Time that both have worked, s of the wall clock."""
+        return self.odometry_busy_s + self.topology_busy_s
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mapped:

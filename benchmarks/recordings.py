@@ -1,4 +1,4 @@
-"""The whole chain in one process, and what each stage costs: what `hmt run` does between its files.
+"""Recorded logs, or pieces of them, as the benchmarks take them.
 
 References: own.
 """
@@ -6,55 +6,13 @@ References: own.
 from __future__ import annotations
 
 import os
-import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from hmt_service.core.config import Config
-from hmt_service.core.engine import Engine
-from hmt_service.core.odometry import Odometry
 from hmt_service.core.types import Reading, Scan
 from hmt_service.io.logs import read_log
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Mapped:
-    """A finished map and the wall-clock time that it has cost."""
-
-    engine: Engine
-    """The map."""
-    scans: int
-    """Number of scans in it."""
-    odometry_s: float
-    """Time in the odometry."""
-    topology_s: float
-    """Time in the engine, the end of the map included."""
-
-    @property
-    def total_s(self) -> float:
-        """Time of both stages."""
-        return self.odometry_s + self.topology_s
-
-
-def map_readings(readings: Iterable[Reading], config: Config) -> Mapped:
-    """Build the map of readings in the order of time."""
-    odometry, engine = Odometry(config), Engine(config)
-    scans, odometry_s, topology_s = 0, 0.0, 0.0
-    for reading in readings:
-        started = time.perf_counter()
-        tracking = odometry.process(reading)
-        tracked = time.perf_counter()
-        odometry_s += tracked - started
-        if tracking is None:
-            continue
-        engine.process(tracking)
-        topology_s += time.perf_counter() - tracked
-        scans += 1
-    started = time.perf_counter()
-    engine.finish()
-    topology_s += time.perf_counter() - started
-    return Mapped(engine, scans, odometry_s, topology_s)
 
 
 def first_scans(readings: Sequence[Reading], scans: int | None) -> tuple[Reading, ...]:

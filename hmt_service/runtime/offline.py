@@ -1,0 +1,50 @@
+"""The stages in one process, one after the other: what the daemon does, reproducibly.
+
+References:
+    own.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable
+
+from hmt_service.core.config import Config
+from hmt_service.core.engine import Engine
+from hmt_service.core.odometry import Odometry
+from hmt_service.core.types import Reading
+from hmt_service.runtime.messages import RunReport
+
+
+def map_readings(
+    readings: Iterable[Reading],
+    config: Config,
+    *,
+    seed: int = 0,
+    on_scan: Callable[[], object] = lambda: None,
+) -> tuple[Engine, RunReport]:
+    """Return the finished engine, and what it has cost.
+
+    Args:
+        readings: In the order of time.
+        config: Settings of all stages.
+        seed: Seed of all randomness.
+        on_scan: Called after each scan.
+    """
+    odometry, engine = Odometry(config), Engine(config, seed=seed)
+    scans, odometry_busy_s, topology_busy_s = 0, 0.0, 0.0
+    for reading in readings:
+        started_s = time.perf_counter()
+        tracking = odometry.process(reading)
+        tracked_s = time.perf_counter()
+        odometry_busy_s += tracked_s - started_s
+        if tracking is None:
+            continue
+        engine.process(tracking)
+        topology_busy_s += time.perf_counter() - tracked_s
+        scans += 1
+        on_scan()
+    started_s = time.perf_counter()
+    engine.finish()
+    topology_busy_s += time.perf_counter() - started_s
+    return engine, RunReport(scans, odometry_busy_s, topology_busy_s)
