@@ -69,6 +69,7 @@ class Odometry:
         self._last_stamp_s: float | None = None
         self._odometry: OdometryReading | None = None
         self._odometry_at_scan: OdometryReading | None = None
+        self._motion_since_odometry = identity()
 
     def process(self, reading: Reading) -> Tracking | None:
         """Take one reading in time order.
@@ -87,10 +88,15 @@ class Odometry:
     def _register(self, scan: Scan) -> Tracking:
         if self._map is None or self._last_stamp_s is None:
             return self._add_keyframe(scan, self._points_of(scan), certain(identity()), None)
-        predicted, motion = self._predict(scan.stamp_s)
+        predicted, motion = self._predict()
         points = self._points_of(scan, motion)
         posed, failure = self._correct(scan, points, predicted)
         self._last_motion = inverse(self._keyframe_from_body.mean) @ posed.mean
+        self._motion_since_odometry = (
+            identity()
+            if self._has_new_odometry
+            else self._motion_since_odometry @ self._last_motion
+        )
         moved = log(posed.mean)
         is_keyframe = (
             float(np.linalg.norm(moved[3:])) >= self._config.keyframe_distance_m
@@ -110,18 +116,25 @@ class Odometry:
             return points
         return voxel_downsample(points, 0.5 * self._config.voxel_size_m)
 
-    def _predict(self, stamp_s: float) -> tuple[GaussianPose, Pose]:
+    @property
+    def _has_new_odometry(self) -> bool:
+        """Whether odometry has come since the scan before."""
+        return self._odometry is not self._odometry_at_scan
+
+    def _predict(self) -> tuple[GaussianPose, Pose]:
         """Return the predicted pose in the last keyframe and the motion since the last scan."""
         now, before = self._odometry, self._odometry_at_scan
-        if now is not None and before is not None:
-            motion = inverse(before.odom_from_body) @ now.odom_from_body
+        if now is not None and before is not None and now is not before:
+            measured = inverse(before.odom_from_body) @ now.odom_from_body
+            # Scans that came without odometry have been tracked through part of it already.
+            motion = inverse(self._motion_since_odometry) @ measured
             noise_scale = 1.0
         else:
-            motion = self._last_motion
+            motion = measured = self._last_motion
             noise_scale = self._motion.constant_velocity_factor
         if self._sensor.is_planar:
-            motion = project_planar(motion)
-        xi = log(motion)
+            motion, measured = project_planar(motion), project_planar(measured)
+        xi = log(measured)
         turned, travelled = float(np.linalg.norm(xi[:3])), float(np.linalg.norm(xi[3:]))
         noise = self._motion
         sigma_rad = noise_scale * (
@@ -142,7 +155,8 @@ class Odometry:
         config = self._config
         if self._map is None or self._last_stamp_s is None:
             return predicted, None
-        if self._odometry is None and scan.stamp_s - self._last_stamp_s > config.max_gap_s:
+        is_bridged = self._odometry_at_scan is not None and self._has_new_odometry
+        if scan.stamp_s - self._last_stamp_s > config.max_gap_s and not is_bridged:
             return predicted, TrackingFailure.GAP_IN_TIME
         if len(points) < config.min_points:
             return predicted, TrackingFailure.TOO_FEW_POINTS
