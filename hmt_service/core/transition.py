@@ -127,8 +127,8 @@ class Transition:
             noise = self._rng.multivariate_normal(
                 np.zeros(6), prior.covariance, size=samples, method="cholesky"
             )
-            positions = (prior.mean @ exp(noise))[:, :3, :3] @ body_in_visit
-            positions += (prior.mean @ exp(noise))[:, :3, 3]
+            area_from_visit = prior.mean @ exp(noise)
+            positions = area_from_visit[:, :3, :3] @ body_in_visit + area_from_visit[:, :3, 3]
             known = np.array([p.mean[:3, 3] for p in visits[candidate.area].visit_from_keyframe])
             distances = np.linalg.norm(positions[:, None] - known[None], axis=2).min(axis=1)
             inside += float(np.mean(distances <= self._config.presence_m))
