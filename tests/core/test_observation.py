@@ -1,0 +1,197 @@
+"""The observation model: what a scan says for a place, and against it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hmt_service.core.config import Preset, load_config
+from hmt_service.core.geometry import (
+    FloatArray,
+    identity,
+    inverse,
+    planar_pose,
+    transform_points,
+)
+from hmt_service.core.observation import BackgroundDensity, ObservationModel
+from hmt_service.core.types import Keyframe
+from tests.core.factories import ROOM, SQUARE, cloud_of, keyframes_along, visit_along
+
+CONFIG = load_config()
+TRUTH = planar_pose(0.5, -0.4, 0.4)
+SUBMAP = cloud_of(ROOM, spacing_m=0.03)
+(KEYFRAME,) = keyframes_along(ROOM, [TRUTH])
+
+
+def model_of(*learned: Keyframe) -> ObservationModel:
+    model = ObservationModel(CONFIG.observation, CONFIG.sensor)
+    for keyframe in learned:
+        model.learn(keyframe)
+    return model
+
+
+@given(
+    ranges=st.lists(st.floats(0.0, 60.0), max_size=50),
+    max_range_m=st.floats(1.0, 50.0),
+)
+def test_background_density_integrates_to_one(ranges: list[float], max_range_m: float) -> None:
+    background = BackgroundDensity(max_range_m)
+    background.learn(np.array(ranges))
+    bins = int(np.ceil(max_range_m / 0.25))
+    middles = np.asarray((np.arange(bins) + 0.5) * 0.25, dtype=np.float64)
+    assert np.sum(background.density(middles)) * 0.25 == pytest.approx(1.0)
+    assert background.density(middles).min() > 0.0
+
+
+def test_background_density_has_known_values() -> None:
+    background = BackgroundDensity(10.0)
+    assert background.density(np.array([0.1, 9.9])) == pytest.approx([0.1, 0.1])
+    background.learn(np.full(60, 5.1))
+    # 40 bins of one reading each and 60 more in one of them, 0.25 m wide.
+    assert background.density(np.array([5.2, 1.0])) == pytest.approx([61 / 25, 1 / 25])
+
+
+def test_longer_ranges_than_the_sensor_has_count_as_its_longest() -> None:
+    background = BackgroundDensity(10.0)
+    background.learn(np.array([50.0]))
+    assert background.density(np.array([9.9]))[0] == pytest.approx(2 / 41 / 0.25)
+
+
+def test_ratio_of_a_perfect_match_has_the_closed_form() -> None:
+    # A circle of 2 m: every beam expects what it reads, p0 is uniform over 40 m.
+    angles = np.linspace(0.0, 2.0 * np.pi, 720, endpoint=False)
+    circle = 2.0 * np.stack([np.cos(angles), np.sin(angles), np.zeros(720)], axis=1)
+    keyframe = replace(KEYFRAME, points_in_body=circle.astype(np.float32))
+    sigma, hit = CONFIG.observation.hit_sigma_m, CONFIG.observation.hit_weight
+    per_beam = np.log(hit / (np.sqrt(2.0 * np.pi) * sigma) * 40.0 + 1.0 - hit)
+    beams = CONFIG.observation.independent_beams
+    assert model_of().log_ratio(keyframe, circle, identity()) == pytest.approx(
+        per_beam * beams, rel=1e-4
+    )
+    # A circle that is larger by two standard deviations.
+    larger = circle * (1.0 + 2.0 * sigma / 2.0)
+    off = np.log(hit * np.exp(-2.0) / (np.sqrt(2.0 * np.pi) * sigma) * 40.0 + 1.0 - hit)
+    assert model_of().log_ratio(keyframe, larger, identity()) == pytest.approx(
+        off * beams, rel=1e-4
+    )
+
+
+def test_true_pose_is_likelier_than_the_background_and_than_any_wrong_one() -> None:
+    model = model_of(KEYFRAME)
+    right = model.log_ratio(KEYFRAME, SUBMAP, TRUTH)
+    assert right > 3.0
+    for offset in [(0.7, 0.0, 0.0), (0.0, 0.7, 0.0), (0.0, 0.0, 0.5), (0.0, 0.0, np.pi)]:
+        assert model.log_ratio(KEYFRAME, SUBMAP, TRUTH @ planar_pose(*offset)) < right - 3.0
+
+
+def test_unknown_space_says_nothing() -> None:
+    model = model_of(KEYFRAME)
+    assert model.log_ratio(KEYFRAME, np.zeros((0, 3)), TRUTH) == 0.0
+    empty = replace(KEYFRAME, points_in_body=np.zeros((0, 3), dtype=np.float32))
+    assert model.log_ratio(empty, SUBMAP, TRUTH) == 0.0
+
+
+def test_beams_into_unknown_space_do_not_change_the_sum() -> None:
+    # Half of the walls known: exactly the beams of that half count, each as it did before.
+    keyframe = replace(
+        KEYFRAME,
+        points_in_body=np.array([[2.0, 0.0, 0.0], [-3.0, 0.0, 0.0]], dtype=np.float32),
+    )
+    wall = np.array([[2.0, y, 0.0] for y in np.linspace(-0.2, 0.2, 41)])
+    model = model_of()
+    alone = replace(keyframe, points_in_body=keyframe.points_in_body[:1])
+    both = model.log_ratio(keyframe, wall, identity())
+    assert both == pytest.approx(model.log_ratio(alone, wall, identity()))
+    assert both > 1.0
+
+
+def test_twice_the_beams_are_not_twice_the_evidence() -> None:
+    twice = replace(KEYFRAME, points_in_body=np.repeat(KEYFRAME.points_in_body, 2, axis=0))
+    model = model_of(KEYFRAME)
+    assert model.log_ratio(twice, SUBMAP, TRUTH) == pytest.approx(
+        model.log_ratio(KEYFRAME, SUBMAP, TRUTH)
+    )
+
+
+def test_fewer_beams_than_are_independent_count_in_full() -> None:
+    model = model_of()
+    points = np.array([[2.0, 0.0, 0.0], [0.0, 2.0, 0.0], [-2.0, 0.0, 0.0]], dtype=np.float32)
+    walls = cloud_of(np.array([[2.0, -1, 2, 1], [-1, 2, 1, 2], [-2, -1, -2, 1]], dtype=float))
+    ratios = [
+        model.log_ratio(replace(KEYFRAME, points_in_body=points[:n]), walls, identity())
+        for n in (1, 2, 3)
+    ]
+    assert np.diff([0.0, *ratios]) == pytest.approx(np.full(3, ratios[0]), rel=0.01)
+
+
+def test_what_is_seen_everywhere_says_less_for_a_place() -> None:
+    """A building of identical rooms raises its own bar."""
+    unlearned = model_of().log_ratio(KEYFRAME, SUBMAP, TRUTH)
+    learned = model_of(*[KEYFRAME] * 50).log_ratio(KEYFRAME, SUBMAP, TRUTH)
+    assert 0.0 < learned < 0.8 * unlearned
+
+
+def test_ratio_of_several_keyframes_is_the_sum() -> None:
+    poses = [TRUTH @ planar_pose(0.1 * i, 0.0, 0.1 * i) for i in range(4)]
+    keyframes = keyframes_along(ROOM, poses)
+    model = model_of(*keyframes)
+    pairs = list(zip(keyframes, poses, strict=True))
+    assert model.log_ratio_of_all(pairs, SUBMAP) == pytest.approx(
+        sum(model.log_ratio(keyframe, SUBMAP, pose) for keyframe, pose in pairs)
+    )
+
+
+@given(x=st.floats(-20, 20), y=st.floats(-20, 20), yaw=st.floats(-3, 3))
+def test_ratio_does_not_depend_on_the_frame_of_the_submap(x: float, y: float, yaw: float) -> None:
+    moved = planar_pose(x, y, yaw)
+    model = model_of(KEYFRAME)
+    found = model.log_ratio(KEYFRAME, transform_points(moved, SUBMAP), moved @ TRUTH)
+    # A point on the border between two cells of the grid may fall to the other side.
+    assert found == pytest.approx(model.log_ratio(KEYFRAME, SUBMAP, TRUTH), rel=0.02)
+
+
+def test_other_rooms_are_told_apart() -> None:
+    model = model_of(KEYFRAME)
+    visit = visit_along(SQUARE, [identity()])
+    assert model.log_ratio(KEYFRAME, visit.points, identity()) < 0.5 * model.log_ratio(
+        KEYFRAME, SUBMAP, TRUTH
+    )
+
+
+def sphere(count: int, radius_m: float) -> FloatArray:
+    rng = np.random.default_rng(3)
+    directions = rng.normal(size=(count, 3))
+    return np.asarray(radius_m * directions / np.linalg.norm(directions, axis=1, keepdims=True))
+
+
+def test_beams_in_space_are_told_apart_by_elevation() -> None:
+    config = load_config(Preset.SPATIAL)
+    model = ObservationModel(config.observation, config.sensor)
+    points = sphere(4000, 10.0)
+    points[:, 2] *= np.where(points[:, 2] > 0.0, 1.0, 0.3)  # a flattened lower half
+    pose = planar_pose(3.0, 1.0, 0.5)
+    keyframe = replace(KEYFRAME, points_in_body=points.astype(np.float32))
+    right = model.log_ratio(keyframe, transform_points(pose, points), pose)
+    upside_down = points * [1.0, 1.0, -1.0]
+    assert right > 3.0
+    assert model.log_ratio(keyframe, transform_points(pose, upside_down), pose) < 0.7 * right
+
+
+def test_sensor_away_from_the_centre_is_where_the_rays_start() -> None:
+    mounted = np.array([0.3, 0.1, 0.0])
+    seen_from = TRUTH @ planar_pose(0.3, 0.1, 0.0)
+    (at_sensor,) = keyframes_along(ROOM, [seen_from])
+    keyframe = replace(
+        at_sensor,
+        points_in_body=(at_sensor.points_in_body + mounted).astype(np.float32),
+        sensor_in_body=mounted,
+    )
+    model = model_of(KEYFRAME)
+    assert model.log_ratio(keyframe, SUBMAP, TRUTH) == pytest.approx(
+        model.log_ratio(at_sensor, SUBMAP, seen_from), rel=0.02
+    )
+    assert inverse(TRUTH) @ seen_from == pytest.approx(planar_pose(0.3, 0.1, 0.0))
