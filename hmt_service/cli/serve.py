@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import logging
 import signal
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -45,6 +47,13 @@ def serve(
     preset: PresetName = Preset.PLANAR,
     config: ConfigFile = None,
     seed: Seed = 0,
+    reorder_window: Annotated[
+        float,
+        typer.Option(
+            min=0.0,
+            help="How long readings wait for earlier ones, s of sensor time; poses are that late.",
+        ),
+    ] = 0.25,
     out: Annotated[
         Path | None, typer.Option(help="Folder to save the map to; without it nothing is saved.")
     ] = None,
@@ -58,6 +67,7 @@ def serve(
     from rich.logging import RichHandler
 
     from hmt_service.service.daemon import Daemon, DaemonSettings
+    from hmt_service.service.intake import IntakeLimits
     from hmt_service.service.results import save_results
     from hmt_service.service.session import Endpoints, Mode
 
@@ -76,16 +86,34 @@ def serve(
         save = partial(save_results, directory=out, config=settings, seed=seed)
     daemon = Daemon(
         DaemonSettings(
-            keys=Keys(site, robot), endpoints=endpoints, config=settings, seed=seed, save=save
+            keys=Keys(site, robot),
+            endpoints=endpoints,
+            config=settings,
+            seed=seed,
+            save=save,
+            limits=IntakeLimits(reorder_s=reorder_window),
         )
     )
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda n, _: daemon.request_stop(signal.Signals(n).name))
-    report = daemon.run(
-        on_open=lambda: console.print(f"serving site {site}, robot {robot} {endpoints}")
-    )
+    with _signals_to(daemon.request_stop):
+        report = daemon.run(
+            on_open=lambda: console.print(f"serving site {site}, robot {robot} {endpoints}")
+        )
     _print(console, report)
     raise typer.Exit(_exit_code(report, is_saving=save is not None))
+
+
+@contextmanager
+def _signals_to(request_stop: Callable[[str], None]) -> Iterator[None]:
+    """Have SIGINT and SIGTERM ask for a stop instead of causing one."""
+    before = {
+        number: signal.signal(number, lambda n, _: request_stop(signal.Signals(n).name))
+        for number in (signal.SIGINT, signal.SIGTERM)
+    }
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _print(console: Console, report: StopReport) -> None:

@@ -9,11 +9,12 @@ References:
 
 from __future__ import annotations
 
+import logging
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from multiprocessing.connection import Connection, wait
-from typing import Any
+from typing import Any, TypeVar
 
 from hmt_service.core.config import Config
 from hmt_service.errors import DaemonFailure, HmtError, Unavailable
@@ -34,6 +35,10 @@ from hmt_service.runtime.messages import (
     dump,
     load,
 )
+
+_LOG = logging.getLogger(__name__)
+
+T = TypeVar("T")
 
 
 def run_odometry(work: Connection, config: Config) -> None:
@@ -99,7 +104,8 @@ class _Topology:
         started = time.perf_counter()
         events = self._engine.finish()
         self._busy_s += time.perf_counter() - started
-        saved = () if self._save is None else self._saved(self._save)
+        save = self._save
+        saved = () if save is None else _guarded(lambda: save(self._engine, self._report()))
         if isinstance(saved, HmtError):
             finished = Finished(finish.number, (), str(saved))
         else:
@@ -108,36 +114,41 @@ class _Topology:
 
     def answer(self, request: Request) -> Result:
         """Return what was asked for, or why there is none."""
-        try:
-            match request:
-                case MapRequest():
-                    return self._engine.global_map(
-                        request.method,
-                        reference_area=request.reference_area,
-                        hypothesis=request.hypothesis,
-                        with_points=request.with_points,
-                    )
-                case CompareRequest():
-                    return self._engine.compare(
-                        reference_area=request.reference_area, hypothesis=request.hypothesis
-                    )
-                case SaveRequest():
-                    if self._save is None:
-                        return Unavailable("the daemon has no output folder to save to")
-                    return self._saved(self._save)
-        except HmtError as error:
-            return error
+        return _guarded(lambda: self._answer(request))
 
-    def _saved(self, save: Save) -> tuple[str, ...] | HmtError:
-        try:
-            return save(self._engine, self._report())
-        except OSError as error:
-            return DaemonFailure(f"the map was not saved: {error}")
-        except HmtError as error:
-            return error
+    def _answer(self, request: Request) -> Result:
+        match request:
+            case MapRequest():
+                return self._engine.global_map(
+                    request.method,
+                    reference_area=request.reference_area,
+                    hypothesis=request.hypothesis,
+                    with_points=request.with_points,
+                )
+            case CompareRequest():
+                return self._engine.compare(
+                    reference_area=request.reference_area, hypothesis=request.hypothesis
+                )
+            case SaveRequest():
+                if self._save is None:
+                    raise Unavailable("the daemon has no output folder to save to")
+                return self._save(self._engine, self._report())
 
     def _report(self) -> RunReport:
         return RunReport(self._scans, self._odometry_busy_s, self._busy_s)
+
+
+def _guarded(answer: Callable[[], T]) -> T | HmtError:
+    """Return the answer, or why there is none: no question may cost the map."""
+    try:
+        return answer()
+    except HmtError as error:
+        return error
+    except OSError as error:
+        return DaemonFailure(f"the map was not saved: {error}")
+    except Exception as error:  # noqa: BLE001 - whatever it is, the map is still there
+        _LOG.exception("a request failed")
+        return DaemonFailure(f"the request failed: {error!r}")
 
 
 def _leave_signals_to_parent() -> None:

@@ -59,7 +59,8 @@ class HmtClient:
         self._endpoint = endpoint
         self._keys = Keys(site, robot)
         self._timeout_s = timeout_s
-        self._session = open_session(Endpoints(mode=Mode.CLIENT, connect=(endpoint,)))
+        endpoints = Endpoints(mode=Mode.CLIENT, connect=(endpoint,), timeout_s=min(3.0, timeout_s))
+        self._session = open_session(endpoints)
         self._publishers: dict[Input, zenoh.Publisher] = {}
 
     def __enter__(self) -> Self:

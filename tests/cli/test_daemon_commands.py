@@ -151,7 +151,7 @@ def test_replay_keeps_the_pace_that_it_is_told(tmp_path: Path) -> None:
 
 def test_a_command_without_daemon_says_where_it_looked() -> None:
     endpoint = free_endpoint()
-    result = CliRunner().invoke(app, ["pose", "--connect", endpoint])
+    result = CliRunner().invoke(app, ["pose", "--connect", endpoint, "--timeout", "0.5"])
     assert isinstance(result.exception, Unavailable)
     assert endpoint in str(result.exception)
 

@@ -13,7 +13,7 @@ from hmt_service.core.config import Config, load_config
 from hmt_service.core.engine import Engine
 from hmt_service.core.odometry import Odometry
 from hmt_service.core.types import Event, GlobalMap, MapMethod, Reading, Scan, Tracking
-from hmt_service.errors import DeadlineExceeded, NotFound, Unavailable
+from hmt_service.errors import DaemonFailure, DeadlineExceeded, NotFound, Unavailable
 from hmt_service.runtime.messages import (
     CompareRequest,
     Finish,
@@ -41,6 +41,10 @@ def save_area_count(engine: Engine, report: RunReport) -> tuple[str, ...]:
 
 def fail_to_save(_engine: Engine, _report: RunReport) -> tuple[str, ...]:
     raise OSError(28, "No space left on device")
+
+
+def stumble(_engine: Engine, _report: RunReport) -> tuple[str, ...]:
+    raise ZeroDivisionError("a bug")
 
 
 class Recorder:
@@ -246,6 +250,21 @@ def test_a_map_that_cannot_be_saved_is_reported_and_kept(config: Config) -> None
     assert isinstance(
         Answers(pipeline, MapRequest(MapMethod.CONSISTENT, with_points=False)).wait(), GlobalMap
     )
+    assert pipeline.stop(5.0) == ()
+
+
+def test_a_bug_in_an_answer_costs_the_answer_and_not_the_map(config: Config) -> None:
+    pipeline, recorder = Pipeline(config, save=stumble), Recorder()
+    pipeline.start(recorder)
+    running = Running(pipeline, recorder)
+    running.feed(readings(20))
+    answer = Answers(pipeline, SaveRequest()).wait()
+    assert isinstance(answer, DaemonFailure)
+    assert "a bug" in str(answer)
+    failure = running.finish().failure
+    assert failure is not None
+    assert "a bug" in failure
+    assert pipeline.failure(0.0) is None
     assert pipeline.stop(5.0) == ()
 
 
