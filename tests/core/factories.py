@@ -144,3 +144,34 @@ def drifting(path: Sequence[Pose], *, scale: float, turn_rad_per_m: float) -> li
         wrong[:2, 3] *= scale
         result.append(result[-1] @ wrong)
     return result
+
+
+RING = np.concatenate(
+    [
+        box(0.0, 0.0, 20.0, 14.0),
+        box(2.5, 2.5, 17.5, 11.5),
+        box(4.0, 0.0, 4.6, 0.5),
+        box(9.0, 0.0, 9.4, 0.7),
+        box(14.0, 0.0, 15.5, 0.3),
+        box(19.5, 5.0, 20.0, 6.5),
+        box(19.3, 9.0, 20.0, 9.3),
+        box(12.0, 13.4, 12.5, 14.0),
+        box(6.0, 13.7, 8.0, 14.0),
+        box(0.0, 7.0, 0.6, 7.4),
+        box(0.0, 4.0, 0.3, 5.5),
+    ]
+)
+"""A corridor around a block, 2.5 m wide, with pillars that make every side of it different."""
+
+
+def ring_path(*, laps: float, step_m: float = 0.25) -> list[Pose]:
+    """Return poses along the middle of the ring, which turn in steps at its corners."""
+    path = []
+    pose = planar_pose(1.25, 1.25, 0.0)
+    for side in range(round(4 * laps)):
+        length_m = 17.5 if side % 2 == 0 else 11.5
+        path += line(pose, length_m=length_m, step_m=step_m)[:-1]
+        corner = pose @ planar_pose(length_m, 0.0, 0.0)
+        path += [corner @ planar_pose(0.0, 0.0, 0.1 * np.pi * i) for i in range(5)]
+        pose = corner @ planar_pose(0.0, 0.0, 0.5 * np.pi)
+    return path
