@@ -1,0 +1,141 @@
+"""Refinement: ties only where the hypothesis is sure of them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hmt_service.core.alignment import Aligner
+from hmt_service.core.config import Config, load_config
+from hmt_service.core.geometry import Pose, identity, inverse, log, planar_pose
+from hmt_service.core.graph import Factor, PoseGraph
+from hmt_service.core.hypotheses import Assignment, Hypothesis
+from hmt_service.core.refinement import Refinement
+from hmt_service.core.submap import Visit
+from tests.core.factories import ROOM, SQUARE, box, gaussian, line, visit_along
+
+FAR = np.concatenate([box(40.0, -2.0, 48.0, 2.0), box(42.0, -1.0, 43.0, 1.0)])
+WORLD = np.concatenate([ROOM, FAR])
+STARTS = [planar_pose(-1.5, 0.2, 0.0), planar_pose(44.0, 0.0, 0.0), planar_pose(-1.2, 0.0, 0.1)]
+"""Visits to a room, to another one far away, and to the first one again."""
+VISITS = {
+    i: visit_along(WORLD, line(start, length_m=1.5), visit=i) for i, start in enumerate(STARTS)
+}
+TRUTH = inverse(STARTS[0]) @ STARTS[2]
+
+
+def believed(
+    *,
+    error: Pose | None = None,
+    sigma_m: float = 0.1,
+    sigma_rad: float = 0.002,
+    loop: Pose | None = None,
+) -> Hypothesis:
+    """Return a hypothesis that the third visit is where the motion says, off by `error`.
+
+    Args:
+        error: Error of the last motion.
+        sigma_m: Standard deviation of each motion.
+        sigma_rad: Standard deviation of its heading; the rooms are 45 m apart.
+        loop: Alignment with the first area; None: the third visit founded an area.
+    """
+    graph = PoseGraph(is_planar=True)
+    graph.add_reference(0)
+    end = STARTS[2] if error is None else STARTS[2] @ error
+    for a, motion in enumerate((inverse(STARTS[0]) @ STARTS[1], inverse(STARTS[1]) @ end)):
+        graph.add_factor(Factor(a, a + 1, gaussian(motion, sigma_m=sigma_m, sigma_rad=sigma_rad)))
+    last = Assignment(2, 2, None)
+    if loop is not None:
+        aligned = gaussian(loop)
+        graph.add_factor(Factor(0, 2, aligned))
+        last = Assignment(2, 0, aligned)
+    return Hypothesis(0, 0.0, (Assignment(0, 0, None), Assignment(1, 1, None), last), graph)
+
+
+def refined(
+    hypothesis: Hypothesis, visits: dict[int, Visit] | None = None, config: Config | None = None
+) -> Hypothesis:
+    config = config or load_config()
+    known = visits or VISITS
+    return Refinement(config, Aligner(config)).refine(hypothesis, known[2], known)
+
+
+def test_overlapping_visits_are_tied_where_they_align() -> None:
+    hypothesis = believed(error=planar_pose(0.05, -0.04, 0.005))
+    result = refined(hypothesis)
+    assert result.graph.has_factor(0, 2)
+    (tie,) = (f for f in result.graph.factors if (f.visit_a, f.visit_b) == (0, 2))
+    assert np.abs(log(inverse(TRUTH) @ tie.a_from_b.mean)).max() < 0.01
+    found = result.graph.relative(0, 2)
+    assert np.abs(log(inverse(TRUTH) @ found.mean)).max() < 0.015
+    assert found.covariance[3, 3] < 0.1 * hypothesis.graph.relative(0, 2).covariance[3, 3]
+
+
+def test_what_is_refined_is_not_changed() -> None:
+    hypothesis = believed(error=planar_pose(0.05, 0.0, 0.0))
+    before = hypothesis.graph.pose(2).tolist()
+    assert refined(hypothesis) is not hypothesis
+    assert not hypothesis.graph.has_factor(0, 2)
+    assert hypothesis.graph.pose(2).tolist() == before
+
+
+def test_topology_is_not_decided_here() -> None:
+    hypothesis = believed()
+    result = refined(hypothesis)
+    assert result.graph.has_factor(0, 2)
+    assert result.topological_path == hypothesis.topological_path == (0, 1, 2)
+    assert result.assignments[2].area_from_visit is None
+    assert result.log_weight == hypothesis.log_weight
+
+
+def test_alignment_with_its_own_area_is_replaced_by_the_better_one() -> None:
+    rough = TRUTH @ planar_pose(0.04, 0.03, 0.0)
+    hypothesis = believed(loop=rough)
+    result = refined(hypothesis)
+    aligned = result.assignments[2].area_from_visit
+    assert aligned is not None
+    assert np.abs(log(inverse(TRUTH) @ aligned.mean)).max() < 0.01
+    assert len(result.graph.factors) == len(hypothesis.graph.factors) == 3
+    assert result.topological_path == (0, 1, 0)
+
+
+@pytest.mark.parametrize("sigma_m", [0.6, 2.0])
+def test_uncertain_pairs_are_left_alone(sigma_m: float) -> None:
+    hypothesis = believed(sigma_m=sigma_m)
+    assert refined(hypothesis) is hypothesis
+
+
+def test_match_that_contradicts_the_graph_is_refused() -> None:
+    # The submaps say 0.1 m, the graph is sure to a few millimetres that they are wrong.
+    hypothesis = believed(error=planar_pose(0.1, 0.0, 0.0), sigma_m=1e-3, sigma_rad=1e-5)
+    assert refined(hypothesis) is hypothesis
+
+
+def test_visit_just_before_is_not_tied_twice() -> None:
+    starts = [STARTS[1], STARTS[0], STARTS[2]]
+    visits = {
+        i: visit_along(WORLD, line(start, length_m=1.5), visit=i) for i, start in enumerate(starts)
+    }
+    graph = PoseGraph(is_planar=True)
+    graph.add_reference(0)
+    for a in range(2):
+        motion = gaussian(inverse(starts[a]) @ starts[a + 1], sigma_rad=0.002)
+        graph.add_factor(Factor(a, a + 1, motion))
+    before = graph.factors[1].a_from_b
+    hypothesis = Hypothesis(0, 0.0, tuple(Assignment(i, i, None) for i in range(3)), graph)
+    result = refined(hypothesis, visits)
+    assert result is hypothesis
+    assert result.graph.factors[1].a_from_b is before
+
+
+def test_rooms_of_different_size_are_not_tied() -> None:
+    small = visit_along(box(-1.2, -0.8, 1.5, 0.9), [identity()] * 3, visit=0)
+    large = visit_along(SQUARE, [identity()] * 3, visit=2)
+    hypothesis = believed()
+    assert refined(hypothesis, {**VISITS, 0: small, 2: large}) is hypothesis
+
+
+def test_number_of_ties_is_bounded() -> None:
+    config = load_config(text="refinement: {max_neighbours: 0}")
+    hypothesis = believed()
+    assert refined(hypothesis, config=config) is hypothesis
