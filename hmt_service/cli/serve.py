@@ -124,7 +124,9 @@ def _print(console: Console, report: StopReport) -> None:
         f"{report.status.processed_scans} scans in the map, {report.unprocessed} samples not in it",
         soft_wrap=True,
     )
-    if finished is None:
+    if counts.received == 0:
+        console.print("nothing to save")
+    elif finished is None:
         console.print("[red]the map was not saved: nobody was left to do it in time")
     elif finished.failure:
         console.print(f"[red]{finished.failure}")

@@ -28,10 +28,10 @@ _TICK_S = 0.1
 _POLL_S = 0.02
 _DRAIN_S = 3.0
 """Time for the input that waits when the daemon is told to stop."""
-_SAVE_S = 4.5
+_SAVE_S = 4.2
 """Time, from the same moment, after which the map is given up."""
-_STOP_S = 4.8
-"""Time, from the same moment, after which processes are killed."""
+_GRACE_S = 0.3
+"""Time for a process to end by itself."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,7 +63,7 @@ class StopReport:
     status: Status
     """Its last words."""
     finished: Finished | None
-    """What was saved; None when there was no time for it, or nobody to do it."""
+    """What was saved; None when there was nothing, no time for it, or nobody to do it."""
     killed: tuple[ProcessName, ...]
     """Processes that did not end in time."""
 
@@ -130,12 +130,12 @@ class Daemon:
     def _stop(
         self, gateway: Gateway, pipeline: Pipeline, failure: ProcessFailure | None
     ) -> StopReport:
-        started_s = time.monotonic()
         gateway.close_input()
         if failure is not None:
             gateway.publish([Event(EventKind.PROCESS_FAILED, gateway.stamp_s, str(failure))])
         finished = _finish(gateway, pipeline, is_broken=failure is not None)
-        killed = pipeline.stop(max(0.0, started_s + _STOP_S - time.monotonic()))
+        # What children do from now on (load libraries, compute) is of no use to anybody.
+        killed = pipeline.stop(_GRACE_S if finished is not None else 0.0)
         status = gateway.status()
         gateway.close()
         return StopReport(self._reason or str(failure), failure, status, finished, killed)
@@ -143,6 +143,8 @@ class Daemon:
 
 def _finish(gateway: Gateway, pipeline: Pipeline, *, is_broken: bool) -> Finished | None:
     """Process what waits, as far as time allows, and save the map; None without success."""
+    if gateway.status().input.received == 0:
+        return None
     started_s = time.monotonic()
     finished: Future[Finished] = Future()
     gateway.finish(finished.set_result)
