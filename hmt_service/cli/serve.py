@@ -75,9 +75,11 @@ def serve(
     handler = RichHandler(console=console, show_path=False)
     logging.basicConfig(level=logging.INFO, format="%(message)s", handlers=[handler])
     settings = load_settings(preset, config)
+    listening = listen or ([] if connect else [DEFAULT_ENDPOINT])
     endpoints = Endpoints(
-        mode=Mode.PEER,
-        listen=tuple(listen or ([] if connect else [DEFAULT_ENDPOINT])),
+        # A router passes nothing between peers that cannot find each other: be its client.
+        mode=Mode.PEER if listening else Mode.CLIENT,
+        listen=tuple(listening),
         connect=tuple(connect or []),
         has_scouting=scouting,
     )

@@ -70,14 +70,23 @@ class RunningDaemon:
 
 
 @contextmanager
-def running_daemon(out: Path, *arguments: str, is_awaited: bool = True) -> Iterator[RunningDaemon]:
-    """Run a daemon; it is ready for work unless `is_awaited` is false, and is killed at the end."""
-    endpoint = free_endpoint()
+def running_daemon(
+    out: Path, *, router: str | None = None, is_awaited: bool = True
+) -> Iterator[RunningDaemon]:
+    """Run a daemon that is killed at the end.
+
+    Args:
+        out: Folder to save to.
+        router: Endpoint of a router to reach it through, instead of its own.
+        is_awaited: Whether it shall be ready for work.
+    """
+    endpoint = router or free_endpoint()
     settings = out.parent / "settings.yaml"
     settings.write_text(SETTINGS)
-    command = [sys.executable, "-m", "hmt_service", "serve", "--listen", endpoint]
+    command = [sys.executable, "-m", "hmt_service", "serve"]
+    meeting = ["--connect", router] if router else ["--listen", endpoint]
     with subprocess.Popen(
-        [*command, "--config", str(settings), "--out", str(out), *arguments],
+        [*command, *meeting, "--config", str(settings), "--out", str(out)],
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,

@@ -28,7 +28,7 @@ from hmt_service.service.keys import Call, Keys, Topic
 from hmt_service.service.reports import DaemonState
 from hmt_service.service.session import Endpoints, Mode, open_session
 from tests.flat import readings
-from tests.service.harness import RunningDaemon, running_daemon, wait_until
+from tests.service.harness import RunningDaemon, free_endpoint, running_daemon, wait_until
 
 FILES = ["map.hmt", "summary.json", "trajectory.tum"]
 SURPLUS = 3000
@@ -193,6 +193,21 @@ def test_a_call_that_waits_when_the_daemon_dies_gets_an_error(tmp_path: Path) ->
                 assert waiting.result(timeout=10.0).processed_scans < 1000
             assert time.monotonic() - started_s < 8.0
         assert daemon.process.wait(5.0) == PROCESS_FAILED
+
+
+def test_a_daemon_serves_through_a_router(tmp_path: Path) -> None:
+    endpoint = free_endpoint()
+    config = zenoh.Config()
+    config.insert_json5("mode", '"router"')
+    config.insert_json5("listen/endpoints", json.dumps([endpoint]))
+    config.insert_json5("scouting/multicast/enabled", "false")
+    with zenoh.open(config), running_daemon(tmp_path / "out", router=endpoint) as daemon:
+        with daemon.client() as client:
+            publish(client, 50)
+            # Through the router, too, a question does not overtake what was sent before it.
+            assert client.finish().processed_scans == 50
+        result = CliRunner().invoke(app, ["serve", "--connect", endpoint])
+        assert isinstance(result.exception, DaemonFailure)
 
 
 def test_a_second_daemon_of_the_same_robot_or_endpoint_is_refused(tmp_path: Path) -> None:
