@@ -9,7 +9,16 @@ import pytest
 
 from hmt_service.core.alignment import Aligner, Mode
 from hmt_service.core.config import load_config
-from hmt_service.core.geometry import Pose, identity, inverse, log, planar_pose, yaw_of
+from hmt_service.core.geometry import (
+    GaussianPose,
+    Pose,
+    certain,
+    identity,
+    inverse,
+    log,
+    planar_pose,
+    yaw_of,
+)
 from tests.core.factories import CORRIDOR, ROOM, SQUARE, gaussian, line, visit_along
 
 CONFIG = load_config()
@@ -46,6 +55,16 @@ def test_modes_far_outside_the_prior_do_not_count() -> None:
     assert ALIGNER.modes(VISIT, TARGET, gaussian(wrong, sigma_rad=0.05, sigma_m=0.3)) == ()
     (mode,) = ALIGNER.modes(VISIT, TARGET, gaussian(wrong, sigma_rad=0.05, sigma_m=1.5))
     assert error_of(mode, TRUTH) < 0.01
+
+
+@pytest.mark.parametrize(("sigma_x_m", "is_inside"), [(0.05, False), (1.0, True)])
+def test_gate_has_the_shape_of_the_prior(sigma_x_m: float, is_inside: bool) -> None:
+    # The search is as wide as the prior's longest axis; the truth is 1 m off along the other one.
+    mean = planar_pose(1.0, 0.0, 0.0) @ TRUTH
+    covariance = np.diag([1e-8, 1e-8, 0.05**2, sigma_x_m**2, 1.0, 1e-8])
+    in_target = GaussianPose(planar_pose(float(mean[0, 3]), float(mean[1, 3]), 0.0), covariance)
+    prior = in_target @ certain(planar_pose(0.0, 0.0, yaw_of(mean)))
+    assert len(ALIGNER.modes(VISIT, TARGET, prior)) == int(is_inside)
 
 
 def test_square_room_has_a_mode_per_quarter_turn() -> None:

@@ -194,6 +194,11 @@ def test_scan_of_another_place_has_too_few_correspondences() -> None:
     assert tracking.keyframe is not None
     assert tracking.keyframe.failure is TrackingFailure.TOO_FEW_CORRESPONDENCES
     assert tracking.keyframe.previous_from_body.mean == pytest.approx(moved, abs=0.01)
+    # Nobody knows how the old map lies to the new one: back there, it must not be trusted either.
+    odometry.process(OdometryReading(stamp_s + 0.2, identity()))
+    back = odometry.process(Scan(stamp_s + 0.2, points_from(ROOM, START), np.zeros(3)))
+    assert back is not None
+    assert back.failure is TrackingFailure.TOO_FEW_CORRESPONDENCES
 
 
 def test_too_large_a_correction_is_refused() -> None:
@@ -243,6 +248,16 @@ def test_slipping_wheels_do_not_pull_the_pose() -> None:
     tracking = track(drive(ROOM, [START, START], odometry=slipped))[1]
     assert tracking.failure is None
     assert tracking.keyframe_from_body.mean[:2, 3] == pytest.approx([0.0, 0.0], abs=0.02)
+
+
+def test_wheels_that_contradict_the_scan_are_trusted_less_where_it_is_blind() -> None:
+    turned = [identity(), planar_pose(0.0, 0.0, 0.15)]
+    tracking = track(drive(CORRIDOR, [identity()] * 2, odometry=turned))[1]
+    assert tracking.failure is None
+    assert log(tracking.keyframe_from_body.mean)[2] == pytest.approx(0.0, abs=0.01)
+    # 0.15 rad at a standard deviation of 0.025 rad is 36; the gate is 16.27.
+    sigma_m = np.sqrt(tracking.keyframe_from_body.covariance[3, 3])
+    assert sigma_m == pytest.approx(0.02 * np.sqrt(36.0 / 16.27), rel=0.1)
 
 
 def test_readings_of_wheels_alone_give_nothing() -> None:
