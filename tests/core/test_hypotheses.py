@@ -193,3 +193,14 @@ def test_successors_leave_their_parent_as_it_was() -> None:
     assert parent.graph.visits == (0, 1, 2)
     assert [parent.graph.pose(visit).tolist() for visit in parent.graph.visits] == before
     assert (new.areas, known.areas) == ((0, 1, 3), (0, 1))
+
+
+def test_staying_in_an_area_does_not_lengthen_the_topological_path() -> None:
+    stayed = travelled().extended(
+        Assignment(3, 0, gaussian(planar_pose(0.5, 0.0, 0.0))),
+        Factor(2, 3, gaussian(planar_pose(0.1, 0.0, 0.0))),
+        hypothesis=3,
+        log_weight=0.0,
+    )
+    assert stayed.topological_path == (0, 1, 0)
+    assert stayed.visits_to(0) == (0, 2, 3)
