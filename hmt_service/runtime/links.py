@@ -49,6 +49,7 @@ class Link:
         self._sent = 0
         self._answered = 0
         self._is_ready = False
+        self._is_over = False
         self._threads = (
             threading.Thread(target=self._write, name=f"{name}-write", daemon=True),
             threading.Thread(target=self._read, name=f"{name}-read", daemon=True),
@@ -100,6 +101,8 @@ class Link:
     def _write(self) -> None:
         while (data := self._outbox.get()) is not None:
             self._credit.acquire()
+            if self._is_over:
+                break
             self._sent += 1
             try:
                 self._connection.send_bytes(data)
@@ -120,6 +123,7 @@ class Link:
         except (EOFError, ConnectionResetError):
             pass  # the child is gone
         finally:
+            self._is_over = True
             self._outbox.close()
             self._outbox.discard()
             self._credit.release()

@@ -12,6 +12,7 @@ from __future__ import annotations
 import logging
 import signal
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from multiprocessing.connection import Connection, wait
 from typing import Any, TypeVar
@@ -63,7 +64,7 @@ def run_odometry(work: Connection, config: Config) -> None:
 def run_topology(
     work: Connection, requests: Connection, config: Config, seed: int, save: Save | None
 ) -> None:
-    """Turn trackings into the map until the pipes end; requests go first, between two scans."""
+    """Turn trackings into the map until the pipes end, and answer requests between two scans."""
     _leave_signals_to_parent()
     topology = _Topology(config, seed, save)
     _send(work, Ready())
@@ -166,10 +167,13 @@ def _send(connection: Connection, message: object) -> None:
 
 
 def _received(*connections: Connection) -> Iterator[tuple[Connection, Any]]:
-    """Yield messages, those of earlier connections first, until told to stop."""
+    """Yield messages until told to stop; connections that have one take turns."""
+    turns = deque(connections)
     while True:
         ready = wait(connections)
-        connection = next(c for c in connections if c in ready)
+        connection = next(c for c in turns if c in ready)
+        turns.remove(connection)
+        turns.append(connection)
         try:
             message = load(connection.recv_bytes())
         except (EOFError, OSError):

@@ -286,6 +286,8 @@ class Gateway:
     def _handle_control(self, question: Question[Control]) -> Value | None:
         question.allow()
         match question.name:
+            case Control.FINISH if self._is_stopping:
+                raise Unavailable("the daemon is stopping, and saves the map by itself")
             case Control.FINISH:
                 self.finish(lambda finished: question.answer(self._finished_ack(finished)))
                 return None

@@ -20,6 +20,9 @@ from hmt_service.service.keys import Input
 from hmt_service.service.readings import Refusal, decode_reading
 from hmt_service.service.reports import InputCounts
 
+_OVERHEAD_BYTES = 500
+"""What a sample takes beside its payload: a flood of empty ones must not fill the memory."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class IntakeLimits:
@@ -28,7 +31,7 @@ class IntakeLimits:
     sample_bytes: int = 8_000_000
     """Largest sample; a larger one is refused before it is parsed."""
     queue_bytes: int = 256_000_000
-    """Samples that may wait."""
+    """Memory for samples that wait."""
     reorder_s: float = 0.25
     """How long readings wait for earlier ones, sensor time."""
     silence_s: float = 0.3
@@ -110,7 +113,7 @@ class Intake:
                 self._refused[Refusal.TOO_LARGE] += 1
             elif self._is_stopped:
                 self._refused[Refusal.STOPPING] += 1
-            elif not self._queue.offer(_Sample(name, *read()), size):
+            elif not self._queue.offer(_Sample(name, *read()), size + _OVERHEAD_BYTES):
                 self._refused[Refusal.QUEUE_FULL] += 1
 
     def finish(self, finish: Finish) -> None:

@@ -7,6 +7,7 @@ References:
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Callable, Mapping
 from enum import StrEnum
 from typing import Generic, TypeVar
@@ -16,6 +17,7 @@ import zenoh
 from hmt_service.errors import DaemonFailure, HmtError, InvalidInput, NotFound
 from hmt_service.service.codec import Value, encode
 
+_INTEGER = re.compile(r"[0-9]{1,18}")
 _LOG = logging.getLogger(__name__)
 
 Name = TypeVar("Name", bound=StrEnum)
@@ -60,7 +62,7 @@ class Question(Generic[Name]):
             raise InvalidInput(f"unknown parameters of {self.name}: {', '.join(unknown)}; {known}")
 
     def integer(self, name: str) -> int | None:
-        """Return a parameter that is a number >= 0, or None without it.
+        """Return a parameter that is an integer >= 0, or None without it.
 
         Raises:
             InvalidInput: If it is none.
@@ -68,8 +70,8 @@ class Question(Generic[Name]):
         text = self._parameters.get(name)
         if text is None:
             return None
-        if not (text.isascii() and text.isdigit()):
-            raise InvalidInput(f"{name}={text!r} is not an integer >= 0")
+        if not _INTEGER.fullmatch(text):
+            raise InvalidInput(f"{name}={text[:40]!r} is not an integer of 1 to 18 digits")
         return int(text)
 
     def choice(self, name: str, default: Choice) -> Choice:

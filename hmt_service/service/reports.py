@@ -37,7 +37,7 @@ class InputCounts:
     queued: int
     """Samples that wait to be decoded."""
     queued_bytes: int
-    """Their size."""
+    """The memory that they take."""
     discarded: int
     """Samples thrown away because the daemon had to stop."""
     reordering: int

@@ -253,6 +253,23 @@ def test_a_map_that_cannot_be_saved_is_reported_and_kept(config: Config) -> None
     assert pipeline.stop(5.0) == ()
 
 
+def test_questions_without_end_do_not_stop_the_map(running: Running) -> None:
+    is_over = threading.Event()
+    request = MapRequest(MapMethod.CONSISTENT)
+
+    def ask_again(_: Result) -> None:
+        if not is_over.is_set():
+            running.pipeline.request(request, ask_again, timeout_s=DEADLINE_S)
+
+    running.feed(readings(20))
+    running.finish()
+    for _ in range(8):
+        ask_again(())
+    running.feed(readings(60)[40:])
+    assert running.finish().files == ("1 areas of 60 scans",)
+    is_over.set()
+
+
 def test_a_bug_in_an_answer_costs_the_answer_and_not_the_map(config: Config) -> None:
     pipeline, recorder = Pipeline(config, save=stumble), Recorder()
     pipeline.start(recorder)
