@@ -140,6 +140,19 @@ def test_ring_that_is_driven_twice_closes() -> None:
     assert sum("known" in event.message for event in entered) == best.loop_closures
 
 
+def test_visits_that_are_over_are_tied_to_all_that_they_overlap() -> None:
+    (best, *_) = ring()[0].stored().hypotheses
+    area_of = {assignment.visit: assignment.area for assignment in best.assignments}
+    last = len(area_of) - 1
+    # Neither a motion nor a loop closure: an overlap of two areas, found when a visit was over.
+    ties = [
+        (factor.visit_a, factor.visit_b)
+        for factor in best.factors
+        if factor.visit_b - factor.visit_a > 1 and factor.visit_a != area_of[factor.visit_b]
+    ]
+    assert [tie for tie in ties if tie[1] != last]
+
+
 def test_trajectory_is_close_to_the_truth_where_the_wheels_are_not() -> None:
     engine, _ = ring()
     assert np.linalg.norm((inverse(PATH[0]) @ PATH[-1])[:2, 3] - WHEELS[-1][:2, 3]) > 3.0
