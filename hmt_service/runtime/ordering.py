@@ -11,17 +11,25 @@ import math
 
 from hmt_service.core.types import OdometryReading, Reading
 
+_JUMP_S = 60.0
+"""A step of the stamps beyond this needs a second reading to be believed."""
+
 
 class ReorderWindow:
     """Holds readings back until none can arrive that belongs before them.
 
     The order is by stamp; of equal stamps odometry comes first, then the order of arrival. Stamps
     are the only clock, so that the order of the output depends on the input alone.
+
+    One wrong stamp far in the future must not make everything after it too old: a reading that
+    jumps ahead is held until the next one says whether time has really gone on.
     """
 
     def __init__(self, window_s: float) -> None:
         """Hold readings for `window_s` of sensor time."""
         self._window_s = window_s
+        self._jumped: Reading | None = None
+        self._refuted = 0
         self._heap: list[tuple[float, bool, int, Reading]] = []
         self._arrivals = 0
         self._newest_s = -math.inf
@@ -29,7 +37,12 @@ class ReorderWindow:
 
     def __len__(self) -> int:
         """Return the number of readings held."""
-        return len(self._heap)
+        return len(self._heap) + (self._jumped is not None)
+
+    @property
+    def refuted(self) -> int:
+        """Number of readings dropped so far because the next one had not jumped with them."""
+        return self._refuted
 
     @property
     def released_s(self) -> float:
@@ -45,15 +58,32 @@ class ReorderWindow:
         """
         if reading.stamp_s < self._released_s:
             return None
+        jumped, self._jumped = self._jumped, None
+        if jumped is not None and abs(reading.stamp_s - jumped.stamp_s) <= _JUMP_S:
+            return (*self._add(jumped), *self._add(reading))
+        self._refuted += jumped is not None
+        if self._newest_s < reading.stamp_s - _JUMP_S and math.isfinite(self._newest_s):
+            self._jumped = reading
+            return ()
+        return self._add(reading)
+
+    def flush(self) -> tuple[Reading, ...]:
+        """Return everything that is held, in order, but for a jump that nothing confirms."""
+        return self._release(math.inf)
+
+    def finish(self) -> tuple[Reading, ...]:
+        """Return everything that is held, in order."""
+        jumped, self._jumped = self._jumped, None
+        if jumped is not None:
+            self._add(jumped)
+        return self.flush()
+
+    def _add(self, reading: Reading) -> tuple[Reading, ...]:
         is_scan = not isinstance(reading, OdometryReading)
         heapq.heappush(self._heap, (reading.stamp_s, is_scan, self._arrivals, reading))
         self._arrivals += 1
         self._newest_s = max(self._newest_s, reading.stamp_s)
         return self._release(self._newest_s - self._window_s)
-
-    def flush(self) -> tuple[Reading, ...]:
-        """Return everything that is held, in order."""
-        return self._release(math.inf)
 
     def _release(self, until_s: float) -> tuple[Reading, ...]:
         released = []

@@ -134,12 +134,15 @@ class Intake:
     def counts(self) -> InputCounts:
         """Return what became of everything that arrived."""
         with self._lock:
-            refused = self._refused.total()
+            # Taken at first, and dropped once the next reading had shown the stamp to be wrong.
+            jumped = self._window.refuted
+            refused = self._refused + Counter({Refusal.TIME_JUMPED: jumped})
+            accepted = self._accepted - jumped
             return InputCounts(
                 received=self._received,
-                accepted=self._accepted,
-                refused={str(k): count for k, count in self._refused.items()},
-                queued=self._received - self._accepted - refused - self._discarded,
+                accepted=accepted,
+                refused={str(k): count for k, count in refused.items()},
+                queued=self._received - accepted - refused.total() - self._discarded,
                 queued_bytes=self._queue.size_bytes,
                 discarded=self._discarded,
                 reordering=len(self._window),
@@ -149,13 +152,21 @@ class Intake:
     def _pump(self) -> None:
         while True:
             item = self._queue.get(self._limits.silence_s)
-            released = self._take(item) if isinstance(item, _Sample) else self._window.flush()
-            for reading in released:
+            for reading in self._released_by(item):
                 self._submit(reading)
             if isinstance(item, Finish):
                 self._finish(item)
             elif isinstance(item, _Stop):
                 return
+
+    def _released_by(self, item: _Sample | Finish | _Stop | None) -> tuple[Reading, ...]:
+        match item:
+            case _Sample():
+                return self._take(item)
+            case None:
+                return self._window.flush()
+            case _:
+                return self._window.finish()
 
     def _take(self, sample: _Sample) -> tuple[Reading, ...]:
         decoded = decode_reading(sample.name, sample.payload, sample.encoding, self._sensor)

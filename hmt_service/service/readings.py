@@ -89,6 +89,7 @@ class Refusal(StrEnum):
     NAN_RANGES = "nan_ranges"
     NEGATIVE_RANGES = "negative_ranges"
     TIME_BACKWARDS = "time_backwards"
+    TIME_JUMPED = "time_jumped"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -81,12 +81,6 @@ def test_a_reading_as_old_as_a_released_one_is_taken() -> None:
     assert len(window) == 1
 
 
-def test_a_stamp_far_ahead_does_not_lock_out_the_others() -> None:
-    window = ReorderWindow(0.25)
-    readings: list[Reading] = [scan(1.0), scan(9e9), scan(1.1), scan(1.2)]
-    assert through(window, readings) == [readings[0], readings[2], readings[3], readings[1]]
-
-
 def test_nothing_is_released_before_the_window_has_passed() -> None:
     window = ReorderWindow(0.25)
     first, second, third = scan(1.0), scan(1.25), scan(1.26)
@@ -94,3 +88,30 @@ def test_nothing_is_released_before_the_window_has_passed() -> None:
     assert window.push(first) == ()
     assert window.push(second) == ()
     assert window.push(third) == (first,)
+
+
+def test_a_stamp_far_ahead_costs_itself_and_does_not_lock_out_the_others() -> None:
+    window = ReorderWindow(0.25)
+    before, wrong, after = scan(1.0), scan(1e9), [scan(1.5), scan(2.0)]
+    released = [*(window.push(before) or ()), *window.flush()]
+    assert window.push(wrong) == ()
+    assert window.flush() == ()
+    for reading in after:
+        released += window.push(reading) or ()
+    assert [*released, *window.flush()] == [before, *after]
+    assert window.refuted == 1
+
+
+def test_a_pause_that_the_next_reading_confirms_costs_nothing() -> None:
+    readings: list[Reading] = [scan(1.0), odometry(5000.0), scan(5000.0), scan(5000.5)]
+    window = ReorderWindow(0.25)
+    assert through(window, readings) == readings
+    assert window.refuted == 0
+
+
+def test_the_last_reading_may_have_jumped() -> None:
+    window = ReorderWindow(0.25)
+    window.push(scan(1.0))
+    window.push(last := scan(1000.0))
+    assert len(window) == 2
+    assert window.finish()[-1] is last
