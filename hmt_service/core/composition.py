@@ -118,5 +118,5 @@ def _aligned(area_from_visit: GaussianPose | None) -> GaussianPose:
 
 
 def _covariance(samples: FloatArray, mean: Pose) -> FloatArray:
-    xi = np.array([log(error) for error in inverse(mean) @ samples])
+    xi = log(inverse(mean) @ samples)
     return symmetric(xi.T @ xi / len(xi))

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial.transform import Rotation
 
 from hmt_service.errors import InvalidInput
 
@@ -95,20 +96,18 @@ def exp(xi: FloatArray) -> FloatArray:
     return result
 
 
-def log(pose: Pose) -> FloatArray:
-    """Return the tangent vector of a transform, shape (6,); rotation angle below pi."""
-    quaternion = quaternion_of(pose)
-    half_sine = np.linalg.norm(quaternion[:3])
-    angle = 2.0 * np.arctan2(half_sine, quaternion[3])
-    if half_sine < _SMALL_ANGLE_RAD:
-        phi = 2.0 * quaternion[:3]
-        inverse_jacobian = np.eye(3) - 0.5 * _skew(phi)
-    else:
-        phi = quaternion[:3] / half_sine * angle
-        k = _skew(phi)
-        cotangent = 1.0 / angle**2 - (1.0 + np.cos(angle)) / (2.0 * angle * np.sin(angle))
-        inverse_jacobian = np.eye(3) - 0.5 * k + cotangent * (k @ k)
-    return np.concatenate([phi, inverse_jacobian @ pose[:3, 3]])
+def log(pose: FloatArray) -> FloatArray:
+    """Return the tangent vectors of transforms, shape (..., 4, 4) -> (..., 6); angles below pi."""
+    rotations = pose[..., :3, :3].reshape(-1, 3, 3)
+    phi = Rotation.from_matrix(rotations).as_rotvec().reshape(*pose.shape[:-2], 3)
+    angle = np.linalg.norm(phi, axis=-1)[..., None, None]
+    is_small = angle < _SMALL_ANGLE_RAD
+    safe = np.where(is_small, 1.0, angle)
+    b = np.where(is_small, 1.0 / 12.0, (1.0 - 0.5 * safe / np.tan(0.5 * safe)) / safe**2)
+    k = _skew(phi)
+    inverse_jacobian = np.eye(3) - 0.5 * k + b * (k @ k)
+    rho = (inverse_jacobian @ pose[..., :3, 3, None])[..., 0]
+    return np.concatenate([phi, rho], axis=-1)
 
 
 def quaternion_of(pose: Pose) -> FloatArray:
