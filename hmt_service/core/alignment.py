@@ -32,6 +32,7 @@ _SINGLE_BASIN_M = 0.25
 _SINGLE_BASIN_RAD = 0.05
 _SEPARATION_M = 0.6
 _SEPARATION_RAD = 0.15
+_SEPARATION_SIGMA = 4.0
 _PEAK_SHARE = 0.6
 
 
@@ -79,8 +80,11 @@ class Aligner:
         config = self._config
         pose = guess
         # Coarse to fine: the first pass bridges the raster, the second the voxel.
-        for reach_m in (4.0 * config.inlier_m, 1.5 * config.inlier_m):
-            registered = target.registration_map.register(
+        for target_map, reach_m in (
+            (target.coarse_map, 4.0 * config.inlier_m),
+            (target.registration_map, 1.5 * config.inlier_m),
+        ):
+            registered = target_map.register(
                 visit.points, pose, max_correspondence_m=reach_m, kernel_m=0.3 * reach_m
             )
             if registered is None:
@@ -179,7 +183,7 @@ class Aligner:
         order = np.argsort(-scores[tuple(found.T)], kind="stable")[: 2 * config.max_modes]
         poses = []
         for turn, row, column in found[order]:
-            pose = prior.mean @ planar_pose(0.0, 0.0, 0.0)
+            pose = prior.mean.copy()
             pose[:3, :3] = planar_pose(0.0, 0.0, float(turns[turn]))[:3, :3] @ prior.mean[:3, :3]
             centre = pose[:3, :3] @ visit.centre
             pose[:2, 3] = rows[row] - centre[0], columns[column] - centre[1]
@@ -193,18 +197,20 @@ class Aligner:
         )
 
     def _distinct(self, modes: list[Mode]) -> tuple[Mode, ...]:
+        """Return one mode per basin: a corridor of equally good poses is a single one."""
         kept: list[Mode] = []
         for mode in sorted(modes, key=lambda mode: -mode.overlap):
-            apart = [
-                log(inverse(other.target_from_visit.mean) @ mode.target_from_visit.mean)
-                for other in kept
-            ]
-            if all(
-                np.linalg.norm(xi[3:]) > _SEPARATION_M or np.linalg.norm(xi[:3]) > _SEPARATION_RAD
-                for xi in apart
-            ):
+            pose = mode.target_from_visit
+            if all(_are_apart(other.target_from_visit, pose) for other in kept):
                 kept.append(mode)
         return tuple(kept[: self._config.max_modes])
+
+
+def _are_apart(first: GaussianPose, second: GaussianPose) -> bool:
+    together = GaussianPose(first.mean, first.covariance + second.covariance)
+    xi = log(inverse(first.mean) @ second.mean)
+    is_far = np.linalg.norm(xi[3:]) > _SEPARATION_M or np.linalg.norm(xi[:3]) > _SEPARATION_RAD
+    return bool(is_far and together.mahalanobis2(second.mean) > _SEPARATION_SIGMA**2)
 
 
 def _position_covariance(pose: GaussianPose, point: FloatArray) -> FloatArray:

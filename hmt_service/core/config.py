@@ -31,8 +31,6 @@ class SensorConfig(Section):
     """Returns nearer than this are the robot itself."""
     max_range_m: float = Field(default=40.0, gt=0.0)
     """Returns farther than this are no returns."""
-    range_sigma_m: float = Field(default=0.03, gt=0.0)
-    """Standard deviation of one range."""
 
 
 class OdometryConfig(Section):
@@ -60,6 +58,8 @@ class OdometryConfig(Section):
     """A registration that moves the prediction farther is refused."""
     max_correction_rad: float = Field(default=0.6, gt=0.0)
     """A registration that turns the prediction farther is refused."""
+    max_failures: int = Field(default=5, ge=1)
+    """After so many scans in a row that were not registered, the robot is lost and starts anew."""
     max_gap_s: float = Field(default=5.0, gt=0.0)
     """Without odometry, a pause longer than this cannot be bridged."""
 
@@ -77,6 +77,8 @@ class MotionConfig(Section):
     """Least standard deviation of a translation."""
     sigma_floor_rad: float = Field(default=0.01, gt=0.0)
     """Least standard deviation of a rotation."""
+    max_speed_m_s: float = Field(default=5.0, gt=0.0)
+    """Odometry that moves faster has jumped; a robot out of sight cannot have gone farther."""
     constant_velocity_factor: float = Field(default=5.0, ge=1.0)
     """How many times less the motion is known without odometry, from constant velocity."""
 
@@ -107,6 +109,8 @@ class AreaConfig(Section):
     """Largest normalized cut accepted as a border between areas."""
     min_keyframes: int = Field(default=4, ge=2)
     """Fewest keyframes on either side of a border."""
+    max_keyframes: int = Field(default=200, ge=4)
+    """An area visit of so many keyframes is cut at its cheapest border, whatever that costs."""
 
 
 class AlignmentConfig(Section):
@@ -121,7 +125,7 @@ class AlignmentConfig(Section):
     max_modes: int = Field(default=4, ge=1)
     """Most poses kept per pair of submaps."""
     min_overlap: float = Field(default=0.45, ge=0.0, le=1.0)
-    """Least share of the smaller submap that the other must explain at a pose."""
+    """Least share of a visit's submap that the other must explain at a pose."""
     inlier_m: float = Field(default=0.2, gt=0.0)
     """Distance below which a point counts as explained."""
 
@@ -222,6 +226,7 @@ _PRESETS: dict[Preset, dict[str, Any]] = {
             "window_keyframes": 15,
             "max_correction_m": 5.0,
         },
+        "motion": {"max_speed_m_s": 50.0},
         "areas": {"cell_size_m": 1.0},
         "alignment": {"raster_m": 0.5, "inlier_m": 0.6},
         "observation": {"hit_sigma_m": 0.4, "angular_resolution_rad": 0.035},

@@ -10,7 +10,7 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -78,6 +78,7 @@ class Engine:
         self._visits: dict[int, Visit] = {}
         self._motions: list[Factor] = []
         self._scans: list[StoredScan] = []
+        self._weighed: dict[int, dict[int, float]] = {}
         self._next_hypothesis = 0
         self._revision = 0
         self._finished_revision = 0
@@ -102,20 +103,25 @@ class Engine:
         self._observation.learn(keyframe)
         if not self._visits:
             return self._begin(keyframe)
-        events: tuple[Event, ...] = ()
+        extended = self._open.with_keyframe(keyframe)
         if keyframe.failure is not None:
-            lost = _lost(keyframe, keyframe.failure)
-            border = len(self._open.keyframes)
-            return (lost, *self._enter(self._open.with_keyframe(keyframe), border))
-        self._visits[self._open.visit] = self._open.with_keyframe(keyframe)  # metric SLAM
-        events += self._weigh(keyframe)  # Eq. (12)
+            first_of_new = len(self._open.keyframes)
+            return (_lost(keyframe, keyframe.failure), *self._enter(extended, first_of_new))
+        self._visits[extended.visit] = extended  # metric SLAM
+        events = self._weigh(keyframe)  # Eq. (12)
+        border = self._border(extended)  # AAM
+        return events if border is None else (*events, *self._enter(extended, border))  # TSBI
+
+    def _border(self, visit: Visit) -> int | None:
+        """Return the first keyframe of the area that the robot has entered, if it has."""
         areas = self._config.areas
-        split = partition(  # AAM
-            overlap_of(self._open.cells), max_cut=areas.max_cut, min_keyframes=areas.min_keyframes
+        is_full = len(visit.keyframes) >= areas.max_keyframes
+        split = partition(
+            overlap_of(visit.cells),
+            max_cut=_ANY_CUT if is_full else areas.max_cut,
+            min_keyframes=areas.min_keyframes,
         )
-        if split is not None:
-            events += self._enter(self._open, split.first_of_new)  # TSBI
-        return events
+        return None if split is None else split.first_of_new
 
     def finish(self) -> tuple[Event, ...]:
         """Refine what the last visit says; more trackings may follow, and twice is as good as once.
@@ -145,6 +151,7 @@ class Engine:
         """Close the open visit at a border and expand every hypothesis over what lies beyond it."""
         closed, opened, motion = visit.split(first_of_new)
         self._visits[closed.visit] = closed
+        self._unweigh(opened.keyframes)
         self._refine(closed)
         arc = Factor(closed.visit, opened.visit, motion)
         self._motions.append(arc)
@@ -175,17 +182,26 @@ class Engine:
         """Multiply the weights by the predictive likelihood of a keyframe, Eq. (12)."""
         if len(self._particles.hypotheses) == 1:
             return ()
-        visit_from_keyframe = self._open.visit_from_keyframe[-1].mean
+        evidence = {h.hypothesis: self._evidence(h, keyframe) for h in self._particles.hypotheses}
+        self._weighed[keyframe.index] = evidence
+        dropped = self._particles.reweight(lambda h: evidence[h.hypothesis])
+        return self._pruned(dropped, keyframe.stamp_s)
 
-        def log_likelihood(hypothesis: Hypothesis) -> float:
-            current = hypothesis.current
-            if current.area_from_visit is None:
-                return 0.0
-            pose = current.area_from_visit.mean @ visit_from_keyframe
-            submap = self._visits[current.area].points
-            return self._observation.log_ratio(keyframe, submap, pose)
+    def _evidence(self, hypothesis: Hypothesis, keyframe: Keyframe) -> float:
+        """Return what the latest keyframe says for a hypothesis, against the background."""
+        visit, area = self._open, hypothesis.current.area
+        if area == visit.visit:
+            return 0.0
+        area_from_visit = inverse(hypothesis.graph.pose(area)) @ hypothesis.graph.pose(visit.visit)
+        pose = area_from_visit @ visit.visit_from_keyframe[-1].mean
+        log_ratio = self._observation.log_ratio(keyframe, self._visits[area].points, pose)
+        return visit.novelty[-1] * log_ratio
 
-        return self._pruned(self._particles.reweight(log_likelihood), keyframe.stamp_s)
+    def _unweigh(self, keyframes: Sequence[Keyframe]) -> None:
+        """Take back what keyframes said as part of a visit that they turned out not to be in."""
+        taken_back = [self._weighed.get(keyframe.index, {}) for keyframe in keyframes]
+        self._weighed.clear()
+        self._particles.reweight(lambda h: -sum(said.get(h.hypothesis, 0.0) for said in taken_back))
 
     def _refine(self, visit: Visit) -> None:
         """Let every hypothesis use all of a visit that is over, not only its beginning."""
@@ -416,6 +432,7 @@ class Engine:
         return as_points(np.concatenate(clouds))
 
 
+_ANY_CUT = 2.0
 _NO_POINTS: Points = np.zeros((0, 3), dtype=np.float32)
 
 

@@ -14,7 +14,6 @@ import gtsam
 import numpy as np
 
 from hmt_service.core.geometry import (
-    FloatArray,
     GaussianPose,
     Pose,
     adjoint,
@@ -74,10 +73,6 @@ class PoseGraph:
         """All visits in the graph."""
         return tuple(self._poses)
 
-    def has_factor(self, visit_a: int, visit_b: int) -> bool:
-        """Return whether the two visits are tied directly."""
-        return _key(visit_a, visit_b) in self._factors
-
     def add_reference(self, visit: int) -> None:
         """Add the first visit, at the origin."""
         self._poses[visit] = identity()
@@ -115,10 +110,6 @@ class PoseGraph:
         )
         jacobian = np.hstack([-adjoint(inverse(a_from_b)), np.eye(6)])
         return GaussianPose(a_from_b, symmetric(jacobian @ joint @ jacobian.T))
-
-    def marginal(self, visit: int) -> FloatArray:
-        """Return the covariance of a visit's pose in the reference frame, shape (6, 6)."""
-        return np.asarray(self._solved_marginals().marginalCovariance(visit))
 
     def _change(self) -> None:
         self._is_solved = False

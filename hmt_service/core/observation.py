@@ -7,8 +7,6 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
 import numpy as np
 
 from hmt_service.core.config import ObservationConfig, SensorConfig
@@ -76,40 +74,35 @@ class ObservationModel:
             return 0.0
         ranges = _ranges(rays)
         predicted = transform_points(inverse(submap_from_body), submap) - keyframe.sensor_in_body
-        expected = self._nearest_expectation(predicted, rays, ranges)
-        is_known = np.isfinite(expected)
+        expected = self._expectations(predicted, rays)
+        is_known = np.isfinite(expected[1])
         if not np.any(is_known):
             return 0.0
-        sigma, hit = self._config.hit_sigma_m, self._config.hit_weight
-        residual = (ranges[is_known] - expected[is_known]) / sigma
-        density = np.exp(-0.5 * residual**2) / (np.sqrt(2.0 * np.pi) * sigma)
+        density = self._hit_density(ranges[is_known], expected[:, is_known])
+        hit = self._config.hit_weight
         ratio = np.log(hit * density / self.background.density(ranges[is_known]) + (1.0 - hit))
         return float(ratio.sum() * min(1.0, self._config.independent_beams / len(rays)))
 
-    def log_ratio_of_all(
-        self, keyframes: Iterable[tuple[Keyframe, Pose]], submap: FloatArray
-    ) -> float:
-        """Return the summed log ratio of several keyframes, each with its pose in the submap."""
-        return sum(self.log_ratio(keyframe, submap, pose) for keyframe, pose in keyframes)
+    def _hit_density(self, ranges: FloatArray, expected: FloatArray) -> FloatArray:
+        """Return the density of each range, shape (N,), 1/m: the mean over its expectations."""
+        sigma = self._config.hit_sigma_m
+        is_there = np.isfinite(expected)
+        residual = np.where(is_there, expected - ranges, 0.0) / sigma
+        densities = np.exp(-0.5 * residual**2) / (np.sqrt(2.0 * np.pi) * sigma)
+        return np.asarray((densities * is_there).sum(axis=0) / is_there.sum(axis=0))
 
-    def _nearest_expectation(
-        self, predicted: FloatArray, rays: FloatArray, ranges: FloatArray
-    ) -> FloatArray:
-        """Return the expected range of each beam, inf where the submap has nothing there.
+    def _expectations(self, predicted: FloatArray, rays: FloatArray) -> FloatArray:
+        """Return three expected ranges per beam, shape (3, N), inf where the submap has nothing.
 
-        Of a beam's own cell and its two neighbours, the expectation nearest to the reading counts:
-        on a wall seen at a grazing angle one cell spans metres of range.
+        They are those of the beam's own cell (the second) and of its two neighbours: on a wall seen
+        at a grazing angle one cell spans metres of range, and any of them may be the one to come.
         """
         grid = np.full(self._rows * self._columns, np.inf)
         np.minimum.at(grid, self._cells(predicted), _ranges(predicted))
-        cells = self._cells(rays)
-        row, column = np.divmod(cells, self._columns)
-        around = np.stack(
+        row, column = np.divmod(self._cells(rays), self._columns)
+        return np.stack(
             [grid[row * self._columns + (column + step) % self._columns] for step in (-1, 0, 1)]
         )
-        best = np.argmin(np.abs(around - ranges), axis=0)
-        expected = np.take_along_axis(around, best[None], axis=0)[0]
-        return np.where(np.isfinite(grid[cells]), expected, np.inf)
 
     def _cells(self, rays: FloatArray) -> np.ndarray:
         azimuth = np.arctan2(rays[:, 1], rays[:, 0]) + np.pi

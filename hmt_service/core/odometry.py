@@ -39,6 +39,11 @@ from hmt_service.core.types import (
 
 # chi-square 99.9 % for 3 and 6 degrees of freedom: beyond it, odometry and scan contradict.
 _GATE = {3: 16.27, 6: 22.46}
+# Of a heading that may be anything, and of a position that nothing but speed bounds.
+_LOST_RAD = np.pi / np.sqrt(3.0)
+_LOST_M = 100.0
+# Two stamps of one moment may differ by this much.
+_STAMP_SLACK_S = 1.0
 
 
 class Odometry:
@@ -70,6 +75,9 @@ class Odometry:
         self._odometry: OdometryReading | None = None
         self._odometry_at_scan: OdometryReading | None = None
         self._motion_since_odometry = identity()
+        self._last_elapsed_s = 0.0
+        self._registered_s = 0.0
+        self._failures = 0
 
     def process(self, reading: Reading) -> Tracking | None:
         """Take one reading in time order.
@@ -81,32 +89,75 @@ class Odometry:
             What became of the scan; None for odometry.
         """
         if isinstance(reading, OdometryReading):
+            if self._has_jumped(reading):
+                # Its frame has moved, not the robot: nothing before compares with what follows.
+                self._odometry_at_scan = None
             self._odometry = reading
             return None
         return self._register(reading)
 
+    def _has_jumped(self, reading: OdometryReading) -> bool:
+        before = self._odometry
+        if before is None:
+            return False
+        moved_m = np.linalg.norm(reading.odom_from_body[:3, 3] - before.odom_from_body[:3, 3])
+        allowed_s = max(reading.stamp_s - before.stamp_s, 0.0) + _STAMP_SLACK_S
+        return bool(moved_m > self._motion.max_speed_m_s * allowed_s)
+
     def _register(self, scan: Scan) -> Tracking:
         if self._map is None or self._last_stamp_s is None:
-            return self._add_keyframe(scan, self._points_of(scan), certain(identity()), None)
-        predicted, motion = self._predict()
+            return self._begin(scan)
+        elapsed_s = scan.stamp_s - self._last_stamp_s
+        predicted, motion = self._predict(elapsed_s)
         points = self._points_of(scan, motion)
         posed, failure = self._correct(scan, points, predicted)
         self._last_motion = inverse(self._keyframe_from_body.mean) @ posed.mean
+        self._last_elapsed_s = elapsed_s
         self._motion_since_odometry = (
             identity()
             if self._has_new_odometry
             else self._motion_since_odometry @ self._last_motion
         )
-        moved = log(posed.mean)
-        is_keyframe = (
-            float(np.linalg.norm(moved[3:])) >= self._config.keyframe_distance_m
-            or float(np.linalg.norm(moved[:3])) >= self._config.keyframe_angle_rad
-        )
-        if is_keyframe and len(points):
+        self._failures = 0 if failure is None else self._failures + 1
+        if self._is_keyframe(posed.mean, points, failure):
+            if failure is not None and not self._has_new_odometry:
+                posed = self._lost(posed.mean, scan.stamp_s - self._registered_s)
             return self._add_keyframe(scan, points, posed, failure)
         self._keyframe_from_body = posed
-        self._remember(scan)
+        self._remember(scan, failure)
         return Tracking(scan.stamp_s, self._keyframes - 1, posed, None, failure)
+
+    def _begin(self, scan: Scan) -> Tracking:
+        points = self._points_of(scan)
+        here = certain(identity())
+        if len(points) < self._config.min_points:
+            return Tracking(scan.stamp_s, 0, here, None, TrackingFailure.TOO_FEW_POINTS)
+        return self._add_keyframe(scan, points, here, None)
+
+    def _is_keyframe(
+        self, keyframe_from_body: Pose, points: FloatArray, failure: TrackingFailure | None
+    ) -> bool:
+        """Return whether the scan is kept: after motion, or to start anew when lost."""
+        config = self._config
+        if len(points) < config.min_points:
+            return False
+        if failure is not None:
+            # One bad scan is no reason to give the window up.
+            is_hopeless = failure is TrackingFailure.GAP_IN_TIME
+            return is_hopeless or self._failures >= config.max_failures
+        moved = log(keyframe_from_body)
+        return bool(
+            np.linalg.norm(moved[3:]) >= config.keyframe_distance_m
+            or np.linalg.norm(moved[:3]) >= config.keyframe_angle_rad
+        )
+
+    def _lost(self, mean: Pose, elapsed_s: float) -> GaussianPose:
+        """Return a pose that is bounded by the robot's speed only."""
+        sigma_m = min(self._motion.max_speed_m_s * elapsed_s, _LOST_M)
+        covariance = np.diag([_LOST_RAD**2] * 3 + [sigma_m**2] * 3)
+        if self._sensor.is_planar:
+            covariance = planar_covariance(covariance)
+        return GaussianPose(mean, covariance)
 
     def _points_of(self, scan: Scan, motion: Pose | None = None) -> FloatArray:
         points = scan.points_in_body
@@ -121,28 +172,31 @@ class Odometry:
         """Whether odometry has come since the scan before."""
         return self._odometry is not self._odometry_at_scan
 
-    def _predict(self) -> tuple[GaussianPose, Pose]:
+    def _predict(self, elapsed_s: float) -> tuple[GaussianPose, Pose]:
         """Return the predicted pose in the last keyframe and the motion since the last scan."""
         now, before = self._odometry, self._odometry_at_scan
         if now is not None and before is not None and now is not before:
             measured = inverse(before.odom_from_body) @ now.odom_from_body
             # Scans that came without odometry have been tracked through part of it already.
             motion = inverse(self._motion_since_odometry) @ measured
-            noise_scale = 1.0
+            times, factor = 1.0, 1.0
         else:
-            motion = measured = self._last_motion
-            noise_scale = self._motion.constant_velocity_factor
+            times = elapsed_s / self._last_elapsed_s if self._last_elapsed_s > 0.0 else 1.0
+            motion = measured = exp(times * log(self._last_motion))
+            factor = self._motion.constant_velocity_factor
         if self._sensor.is_planar:
             motion, measured = project_planar(motion), project_planar(measured)
         xi = log(measured)
         turned, travelled = float(np.linalg.norm(xi[:3])), float(np.linalg.norm(xi[3:]))
         noise = self._motion
-        sigma_rad = noise_scale * (
-            noise.sigma_floor_rad
+        scans = max(times, 1.0)
+        sigma_rad = factor * (
+            noise.sigma_floor_rad * scans
             + noise.sigma_rotation_share * turned
             + noise.sigma_rotation_rad_per_m * travelled
         )
-        sigma_m = noise_scale * (noise.sigma_floor_m + noise.sigma_translation_share * travelled)
+        sigma_rad = min(sigma_rad, _LOST_RAD)
+        sigma_m = factor * (noise.sigma_floor_m * scans + noise.sigma_translation_share * travelled)
         covariance = np.diag([sigma_rad**2] * 3 + [sigma_m**2] * 3)
         if self._sensor.is_planar:
             covariance = planar_covariance(covariance)
@@ -230,18 +284,13 @@ class Odometry:
             previous_from_body=previous_from_body,
             failure=failure,
         )
-        if len(points):
-            self._move_window(previous_from_body.mean, points, is_lost=failure is not None)
-            self._keyframes += 1
-            self._keyframe_from_body = certain(identity())
-        self._remember(scan)
-        return Tracking(
-            scan.stamp_s,
-            max(self._keyframes - 1, 0),
-            certain(identity()),
-            keyframe if len(points) else None,
-            failure,
-        )
+        self._move_window(previous_from_body.mean, points, is_lost=failure is not None)
+        self._keyframes += 1
+        self._keyframe_from_body = certain(identity())
+        self._failures = 0
+        self._remember(scan, None)
+        here = certain(identity())
+        return Tracking(scan.stamp_s, keyframe.index, here, keyframe, failure)
 
     def _move_window(self, previous_from_body: Pose, points: FloatArray, *, is_lost: bool) -> None:
         """Express the window in the new keyframe's frame; a lost scan starts a new one."""
@@ -258,6 +307,8 @@ class Odometry:
             is_planar=self._sensor.is_planar,
         )
 
-    def _remember(self, scan: Scan) -> None:
+    def _remember(self, scan: Scan, failure: TrackingFailure | None) -> None:
         self._last_stamp_s = scan.stamp_s
+        if failure is None:
+            self._registered_s = scan.stamp_s
         self._odometry_at_scan = self._odometry

@@ -62,7 +62,11 @@ class Refinement:
         graph = hypothesis.graph.copy()
         assignments = list(hypothesis.assignments)
         for other, mode in ties:
-            graph.add_factor(Factor(other, visit.visit, mode.target_from_visit))
+            # All ties share the visit's own points and bends: together they are worth one.
+            tie = GaussianPose(
+                mode.target_from_visit.mean, len(ties) * mode.target_from_visit.covariance
+            )
+            graph.add_factor(Factor(other, visit.visit, tie))
             if other == founder:
                 assignments[visit.visit] = replace(
                     assignments[visit.visit], area_from_visit=mode.target_from_visit

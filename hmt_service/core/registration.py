@@ -17,6 +17,8 @@ from hmt_service.core.geometry import (
     PLANAR_AXES,
     FloatArray,
     Pose,
+    exp,
+    log,
     project_planar,
     symmetric,
     transform_points,
@@ -35,10 +37,8 @@ _DEGENERATE_SHARE = 0.05
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Match:
-    """How a cloud fits a map."""
+    """How a cloud fits a map at some pose."""
 
-    map_from_points: Pose
-    """Pose of the cloud, shape (4, 4)."""
     information: FloatArray
     """Point-to-plane information for unit residual variance (m^2), tangent order, shape (6, 6)."""
     inlier_share: float
@@ -62,9 +62,14 @@ def deskew(
         motion: Motion of the body during one sweep, shape (4, 4).
         max_range_m: Points beyond are dropped.
     """
+    shares = point_times.ravel()
+    span = float(np.ptp(shares))
+    if span <= 0.0:
+        return points
+    # KISS-ICP stretches the times to a whole sweep, so it gets the motion during their span only.
     preprocessor = kiss_icp_pybind._Preprocessor(max_range_m, 0.0, True, 1)
     vectors = kiss_icp_pybind._Vector3dVector(points)
-    return np.asarray(preprocessor._preprocess(vectors, point_times.ravel(), motion))
+    return np.asarray(preprocessor._preprocess(vectors, shares, exp(span * log(motion))))
 
 
 class RegistrationMap:
@@ -124,7 +129,7 @@ class RegistrationMap:
         moved = transform_points(map_from_points, points)
         neighbours = min(_NORMAL_NEIGHBOURS, self._tree.n)
         found = self._tree.query(moved, k=neighbours)
-        distances, indices = (np.asarray(each).reshape(len(moved), -1) for each in found)
+        distances, indices = (np.asarray(each).reshape(-1, neighbours) for each in found)
         is_inlier = distances[:, 0] <= inlier_m
         share = float(np.mean(is_inlier)) if len(moved) else 0.0
         normals, is_surface = self._normals(indices[is_inlier])
@@ -132,16 +137,7 @@ class RegistrationMap:
         sources = points[is_inlier]
         rows = np.hstack([np.cross(sources, normals_in_points), normals_in_points])[is_surface]
         information = _without_degenerate_directions(symmetric(rows.T @ rows))
-        return Match(map_from_points, information, share)
-
-    def inlier_share(self, points: FloatArray, map_from_points: Pose, *, inlier_m: float) -> float:
-        """Return the share of the cloud within `inlier_m` of the map, in [0, 1]."""
-        if not len(points):
-            return 0.0
-        distances, _ = self._tree.query(
-            transform_points(map_from_points, points), distance_upper_bound=inlier_m
-        )
-        return float(np.mean(np.isfinite(distances)))
+        return Match(information, share)
 
     def _normals(self, indices: np.ndarray) -> tuple[FloatArray, np.ndarray]:
         """Return unit normals, shape (N, 3), and whether there is a surface, shape (N,)."""

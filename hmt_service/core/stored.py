@@ -64,7 +64,7 @@ class StoredHypothesis:
     reference_from_visit: Mapping[int, Pose]
     """Optimised pose of every visit's anchor, shape (4, 4)."""
     factors: tuple[StoredFactor, ...]
-    """The graph, in the order that its factors were added."""
+    """The graph, in the order of their visits."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -67,6 +67,19 @@ class Visit:
         ]
         return voxel_downsample(np.concatenate(clouds), 0.5 * self.config.odometry.voxel_size_m)
 
+    @cached_property
+    def novelty(self) -> tuple[float, ...]:
+        """Share of the cells of each keyframe that no keyframe before it saw, in [0, 1].
+
+        Two looks at one wall are not two pieces of evidence: what a keyframe says counts with this.
+        """
+        seen, shares = self.cells[0], [1.0]
+        for cells in self.cells[1:]:
+            together = np.union1d(seen, cells)
+            shares.append((len(together) - len(seen)) / max(len(cells), 1))
+            seen = together
+        return tuple(shares)
+
     def points_in(self, frame_from_visit: Pose) -> FloatArray:
         """Return the submap in another frame, shape (N, 3), m."""
         return transform_points(frame_from_visit, self.points)
@@ -74,11 +87,18 @@ class Visit:
     @cached_property
     def registration_map(self) -> RegistrationMap:
         """The submap, ready to register against."""
-        odometry = self.config.odometry
+        return self._registration_map(self.config.odometry.voxel_size_m)
+
+    @cached_property
+    def coarse_map(self) -> RegistrationMap:
+        """The same in voxels as wide as the first guess may be off: ICP sees one voxel far."""
+        return self._registration_map(2.0 * self.config.alignment.inlier_m)
+
+    def _registration_map(self, voxel_m: float) -> RegistrationMap:
         return RegistrationMap(
             self.points,
-            voxel_m=odometry.voxel_size_m,
-            points_per_voxel=odometry.points_per_voxel,
+            voxel_m=voxel_m,
+            points_per_voxel=self.config.odometry.points_per_voxel,
             is_planar=self.config.sensor.is_planar,
         )
 

@@ -136,17 +136,15 @@ class Transition:
 
     def _log_factor(self, visit: Visit, target: Visit, prior: GaussianPose, mode: Mode) -> float:
         """Return the log of the Laplace integral of prior times likelihood around one mode."""
-        pose = mode.target_from_visit
-        log_ratio = self._observation.log_ratio_of_all(
-            (
-                (keyframe, pose.mean @ visit_from_keyframe.mean)
-                for keyframe, visit_from_keyframe in zip(
-                    visit.keyframes, visit.visit_from_keyframe, strict=True
-                )
-            ),
-            target.points,
+        # The peak of prior times likelihood; along a corridor only the prior says where that is.
+        peak = prior.fuse(mode.target_from_visit).mean
+        log_ratio = sum(
+            novelty * self._observation.log_ratio(keyframe, target.points, peak @ pose.mean)
+            for keyframe, pose, novelty in zip(
+                visit.keyframes, visit.visit_from_keyframe, visit.novelty, strict=True
+            )
         )
-        return log_ratio + self._log_prior(prior, pose)
+        return log_ratio + self._log_prior(prior, mode.target_from_visit)
 
     def _log_prior(self, prior: GaussianPose, pose: GaussianPose) -> float:
         """Return log of N(x*; prior) times the volume of the mode.

@@ -70,7 +70,7 @@ class Keyframe:
     stamp_s: float
     """Sensor time."""
     points_in_body: Points
-    """Downsampled returns, shape (N, 3), m."""
+    """Returns, shape (N, 3), m; a LiDAR's are downsampled."""
     sensor_in_body: FloatArray
     """Position of the sensor, shape (3,), m."""
     previous_from_body: GaussianPose

@@ -135,14 +135,15 @@ def test_what_is_seen_everywhere_says_less_for_a_place() -> None:
     assert 0.0 < learned < 0.8 * unlearned
 
 
-def test_ratio_of_several_keyframes_is_the_sum() -> None:
-    poses = [TRUTH @ planar_pose(0.1 * i, 0.0, 0.1 * i) for i in range(4)]
-    keyframes = keyframes_along(ROOM, poses)
-    model = model_of(*keyframes)
-    pairs = list(zip(keyframes, poses, strict=True))
-    assert model.log_ratio_of_all(pairs, SUBMAP) == pytest.approx(
-        sum(model.log_ratio(keyframe, SUBMAP, pose) for keyframe, pose in pairs)
-    )
+def test_hit_density_integrates_to_one_at_any_angle() -> None:
+    # The wall is seen from straight ahead to grazing: neighbouring cells differ by metres.
+    model = model_of(KEYFRAME)
+    wall = np.array([[x, 1.0, 0.0] for x in np.linspace(-20.0, 20.0, 4001)])
+    ranges = np.arange(0.0, 40.0, 0.01)
+    for bearing in np.radians([90.0, 45.0, 10.0, 4.0]):
+        rays = np.tile([np.cos(bearing), np.sin(bearing), 0.0], (len(ranges), 1))
+        density = model._hit_density(ranges, model._expectations(wall, rays))
+        assert density.sum() * 0.01 == pytest.approx(1.0, abs=0.01)
 
 
 @given(x=st.floats(-20, 20), y=st.floats(-20, 20), yaw=st.floats(-3, 3))

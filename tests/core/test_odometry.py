@@ -18,7 +18,7 @@ from hmt_service.core.types import (
     Tracking,
     TrackingFailure,
 )
-from tests.core.factories import CORRIDOR, ROOM, drifting, drive, line, points_from
+from tests.core.factories import CORRIDOR, ROOM, box, drifting, drive, line, points_from
 
 CURVE = [
     planar_pose(-2.0 + 4.0 * s, -0.3 + 0.6 * np.sin(5.0 * s), 0.6 * np.sin(4.0 * s))
@@ -183,22 +183,60 @@ def test_scan_without_any_point_makes_no_keyframe() -> None:
     assert tracking.keyframe_from_body.mean == pytest.approx(moved, abs=0.01)
 
 
-def test_scan_of_another_place_has_too_few_correspondences() -> None:
+def test_odometry_that_jumps_is_not_believed() -> None:
     odometry, stamp_s = settled()
-    moved = planar_pose(50.0, 0.0, 0.0)
-    odometry.process(OdometryReading(stamp_s + 0.1, moved))
-    tracking = odometry.process(Scan(stamp_s + 0.1, points_from(ROOM, START), np.zeros(3)))
+    jumped = planar_pose(4e6, -50.0, 2.0)
+    for step in range(1, 4):
+        wheels = jumped @ planar_pose(0.1 * step, 0.0, 0.0)
+        odometry.process(OdometryReading(stamp_s + 0.1 * step, wheels))
+        seen_from = START @ planar_pose(0.1 * (step - 1), 0.0, 0.0)
+        points = points_from(ROOM, seen_from)
+        tracking = odometry.process(Scan(stamp_s + 0.1 * step, points, np.zeros(3)))
+        assert tracking is not None
+        assert tracking.failure is None
+        last = tracking.keyframe_from_body.mean
+    # The jump itself says nothing; what the wheels say after it counts again.
+    assert last == pytest.approx(planar_pose(0.2, 0.0, 0.0), abs=0.02)
+
+
+def test_robot_that_sees_another_place_is_lost_and_starts_anew() -> None:
+    odometry, stamp_s = settled()
+    elsewhere = box(-0.6, -0.5, 0.9, 0.7)
+    patience = load_config().odometry.max_failures
+    trackings = []
+    for step in range(1, patience + 2):
+        points = points_from(elsewhere, identity())
+        tracking = odometry.process(Scan(stamp_s + 0.1 * step, points, np.zeros(3)))
+        assert tracking is not None
+        trackings.append(tracking)
+    reasons = [tracking.failure for tracking in trackings]
+    assert reasons == [TrackingFailure.TOO_FEW_CORRESPONDENCES] * patience + [None]
+    # One bad scan does not cost the map; the last of them starts another.
+    assert [tracking.keyframe is not None for tracking in trackings] == [
+        step == patience for step in range(1, patience + 2)
+    ]
+    lost = trackings[patience - 1].keyframe
+    assert lost is not None
+    assert lost.failure is TrackingFailure.TOO_FEW_CORRESPONDENCES
+    # Without odometry, nothing but the robot's speed says where it is now.
+    sigma_m = float(np.sqrt(lost.previous_from_body.covariance[3, 3]))
+    assert sigma_m == pytest.approx(0.1 * patience * load_config().motion.max_speed_m_s, rel=0.01)
+
+
+def test_pause_of_the_scans_is_bridged_by_constant_velocity() -> None:
+    # A metre per second; 0.3 s without a scan is three times the motion between two of them.
+    stamps = [0.1 * i for i in (*range(8), 11, 12)]
+    odometry = Odometry(load_config())
+    travelled = identity()
+    for stamp_s in stamps:
+        points = points_from(ROOM, START @ planar_pose(stamp_s, 0.0, 0.0))
+        tracking = odometry.process(Scan(100.0 + stamp_s, points, np.zeros(3)))
+        assert tracking is not None
+        if tracking.keyframe is not None:
+            travelled = travelled @ tracking.keyframe.previous_from_body.mean
     assert tracking is not None
-    assert tracking.failure is TrackingFailure.TOO_FEW_CORRESPONDENCES
-    # It is far from the keyframe before, so it starts a map of its own where the wheels say.
-    assert tracking.keyframe is not None
-    assert tracking.keyframe.failure is TrackingFailure.TOO_FEW_CORRESPONDENCES
-    assert tracking.keyframe.previous_from_body.mean == pytest.approx(moved, abs=0.01)
-    # Nobody knows how the old map lies to the new one: back there, it must not be trusted either.
-    odometry.process(OdometryReading(stamp_s + 0.2, identity()))
-    back = odometry.process(Scan(stamp_s + 0.2, points_from(ROOM, START), np.zeros(3)))
-    assert back is not None
-    assert back.failure is TrackingFailure.TOO_FEW_CORRESPONDENCES
+    last = travelled @ tracking.keyframe_from_body.mean
+    assert last[0, 3] == pytest.approx(1.2, abs=0.05)
 
 
 def test_too_large_a_correction_is_refused() -> None:
