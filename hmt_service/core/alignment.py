@@ -7,6 +7,7 @@ References:
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -175,14 +176,21 @@ class Aligner:
     ) -> list[Pose]:
         """Return the poses of the separate local maxima of the correlation, best first."""
         config = self._config
-        width = 2 * int(np.ceil(_SEPARATION_M / config.raster_m)) + 1
-        depth = 2 * int(np.ceil(_SEPARATION_RAD / config.angle_step_rad)) + 1
-        highest = ndimage.maximum_filter(scores, size=(min(depth, len(turns)), width, width))
         least = max(_PEAK_SHARE * float(scores.max()), 0.5 * config.min_overlap)
-        found = np.argwhere((scores == highest) & (scores >= least))
-        order = np.argsort(-scores[tuple(found.T)], kind="stable")[: 2 * config.max_modes]
+        found = _separate_peaks(
+            scores,
+            least=least,
+            apart=np.array(
+                [
+                    _SEPARATION_RAD / config.angle_step_rad,
+                    _SEPARATION_M / config.raster_m,
+                    _SEPARATION_M / config.raster_m,
+                ]
+            ),
+            most=2 * config.max_modes,
+        )
         poses = []
-        for turn, row, column in found[order]:
+        for turn, row, column in found:
             pose = prior.mean.copy()
             pose[:3, :3] = planar_pose(0.0, 0.0, float(turns[turn]))[:3, :3] @ prior.mean[:3, :3]
             centre = pose[:3, :3] @ visit.centre
@@ -204,6 +212,34 @@ class Aligner:
             if all(_are_apart(other.target_from_visit, pose) for other in kept):
                 kept.append(mode)
         return tuple(kept[: self._config.max_modes])
+
+
+def _separate_peaks(
+    scores: np.ndarray, *, least: float, apart: FloatArray, most: int
+) -> list[tuple[int, ...]]:
+    """Return the cells of a grid that no neighbour exceeds, the highest first.
+
+    Args:
+        scores: Grid, shape (T, R, C).
+        least: Lowest score that counts.
+        apart: Distance along each axis, in cells, within which only the highest peak is kept.
+        most: Most peaks returned.
+    """
+    cells = np.argwhere(scores >= least)
+    heights = scores[tuple(cells.T)]
+    limit = np.array(scores.shape) - 1
+    is_peak = np.ones(len(cells), dtype=bool)
+    for step in itertools.product((-1, 0, 1), repeat=3):
+        is_peak &= heights >= scores[tuple(np.clip(cells + step, 0, limit).T)]
+    cells, heights = cells[is_peak], heights[is_peak]
+    peaks: list[tuple[int, ...]] = []
+    while len(cells) and len(peaks) < most:
+        # Of equal heights the first in the order of the grid.
+        peak = cells[int(np.argmax(heights))]
+        peaks.append(tuple(int(index) for index in peak))
+        is_left = np.any(np.abs(cells - peak) > apart, axis=1)
+        cells, heights = cells[is_left], heights[is_left]
+    return peaks
 
 
 def _are_apart(first: GaussianPose, second: GaussianPose) -> bool:
