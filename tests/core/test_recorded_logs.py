@@ -5,15 +5,14 @@ from __future__ import annotations
 from functools import cache
 from pathlib import Path
 
-import pytest
+import numpy as np
 
-from hmt_service.core.config import load_config
-from hmt_service.core.engine import Engine
-from hmt_service.core.odometry import Odometry
+from hmt_service.core.config import Preset, load_config
 from hmt_service.core.types import Reading, Scan, StampedPose
 from hmt_service.io.carmen import read_carmen
 from hmt_service.io.relations import evaluate, read_relations
 from hmt_service.io.trajectory import write_tum
+from hmt_service.runtime.offline import map_readings
 
 CONFIG = load_config()
 
@@ -30,13 +29,7 @@ def mapped(log: Path, *, scans: int | None = None) -> tuple[StampedPose, ...]:
     if scans is not None:
         is_scan = [i for i, reading in enumerate(readings) if isinstance(reading, Scan)]
         readings = readings[: is_scan[scans]]
-    odometry, engine = Odometry(CONFIG), Engine(CONFIG, seed=0)
-    for reading in readings:
-        tracking = odometry.process(reading)
-        if tracking is not None:
-            engine.process(tracking)
-    engine.finish()
-    return engine.trajectory()
+    return map_readings(readings, CONFIG)[0].trajectory()
 
 
 def test_beginning_of_intel_is_accurate(hmt_data: Path) -> None:
@@ -56,15 +49,19 @@ def test_same_log_gives_the_same_file(hmt_data: Path, tmp_path: Path) -> None:
     assert files[0].read_bytes() == files[1].read_bytes()
 
 
-@pytest.mark.parametrize(
-    ("name", "largest_mean_m", "pairs"), [("intel", 0.05, 2984), ("fr079", 0.08, 1685)]
-)
-def test_whole_log_is_accurate(
-    hmt_data: Path, name: str, largest_mean_m: float, pairs: int
-) -> None:
-    trajectory = mapped(hmt_data / f"2d/{name}.clf.bz2")
-    errors = evaluate(trajectory, read_relations(hmt_data / f"2d/{name}.relations"))
-    assert (errors.matched, errors.unmatched) == (pairs, 0)
-    assert errors.all_pairs.translation_mean_m <= largest_mean_m
-    assert errors.loop_closures is not None
-    assert errors.loop_closures.translation_mean_m <= 2.0 * largest_mean_m
+def test_lidar_without_odometry_is_tracked_to_a_few_per_cent(hmt_data: Path) -> None:
+    folder = hmt_data / "3d/kitti00-part"
+    truth = np.loadtxt(folder / "poses.txt").reshape(-1, 3, 4)[:40]
+    config = load_config(Preset.SPATIAL)
+    scans = []
+    for number in range(len(truth)):
+        file = folder / f"velodyne/{number:06d}.bin"
+        points = np.fromfile(file, dtype=np.float32).reshape(-1, 4)[:, :3].astype(np.float64)
+        ranges = np.linalg.norm(points, axis=1)
+        is_inside = (ranges > config.sensor.min_range_m) & (ranges < config.sensor.max_range_m)
+        scans.append(Scan(0.2 * number, points[is_inside], np.zeros(3)))
+    engine, _ = map_readings(scans, config)
+    last = engine.trajectory()[-1].reference_from_body[:3, 3]
+    expected = truth[0, :, :3].T @ (truth[-1, :, 3] - truth[0, :, 3])
+    travelled_m = np.linalg.norm(np.diff(truth[:, :, 3], axis=0), axis=1).sum()
+    assert np.linalg.norm(last - expected) < 0.03 * travelled_m
