@@ -15,7 +15,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
 from hmt_service.errors import InvalidInput
 
@@ -98,11 +97,13 @@ def exp(xi: FloatArray) -> FloatArray:
 
 def log(pose: FloatArray) -> FloatArray:
     """Return the tangent vectors of transforms, shape (..., 4, 4) -> (..., 6); angles below pi."""
-    rotations = pose[..., :3, :3].reshape(-1, 3, 3)
-    phi = Rotation.from_matrix(rotations).as_rotvec().reshape(*pose.shape[:-2], 3)
-    angle = np.linalg.norm(phi, axis=-1)[..., None, None]
-    is_small = angle < _SMALL_ANGLE_RAD
-    safe = np.where(is_small, 1.0, angle)
+    quaternion = quaternion_of(pose)
+    vector, scalar = quaternion[..., :3], quaternion[..., 3:]
+    half_sine = np.linalg.norm(vector, axis=-1, keepdims=True)
+    is_small = half_sine < _SMALL_ANGLE_RAD
+    angle = 2.0 * np.arctan2(half_sine, scalar)
+    phi = vector * np.where(is_small, 2.0, angle / np.where(is_small, 1.0, half_sine))
+    is_small, safe = is_small[..., None], np.where(is_small, 1.0, angle)[..., None]
     b = np.where(is_small, 1.0 / 12.0, (1.0 - 0.5 * safe / np.tan(0.5 * safe)) / safe**2)
     k = _skew(phi)
     inverse_jacobian = np.eye(3) - 0.5 * k + b * (k @ k)
@@ -110,24 +111,24 @@ def log(pose: FloatArray) -> FloatArray:
     return np.concatenate([phi, rho], axis=-1)
 
 
-def quaternion_of(pose: Pose) -> FloatArray:
-    """Return the rotation as a unit quaternion `[x, y, z, w]` with w >= 0, shape (4,)."""
-    r = pose[:3, :3]
-    # Shepperd's method: divide by the largest component, never by one near zero.
-    candidates = np.array([r[0, 0], r[1, 1], r[2, 2], np.trace(r)])
-    case = int(np.argmax(candidates))
-    q = np.empty(4)
-    if case == 3:
-        q[3] = 1.0 + candidates[3]
-        q[:3] = r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]
-    else:
-        i, j, k = case, (case + 1) % 3, (case + 2) % 3
-        q[i] = 1.0 - candidates[3] + 2.0 * r[i, i]
-        q[j] = r[j, i] + r[i, j]
-        q[k] = r[k, i] + r[i, k]
-        q[3] = r[k, j] - r[j, k]
-    q /= np.linalg.norm(q)
-    return q if q[3] >= 0.0 else -q
+def quaternion_of(pose: FloatArray) -> FloatArray:
+    """Return rotations as unit quaternions `[x, y, z, w]`, w >= 0: (..., 4, 4) -> (..., 4)."""
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = np.moveaxis(pose[..., :3, :3], (-2, -1), (0, 1))
+    trace = xx + yy + zz
+    # Shepperd's method: of four equal formulae, take the one that divides by the largest component.
+    formulae = np.stack(
+        [
+            np.stack([1.0 - trace + 2.0 * xx, yx + xy, zx + xz, zy - yz], axis=-1),
+            np.stack([yx + xy, 1.0 - trace + 2.0 * yy, zy + yz, xz - zx], axis=-1),
+            np.stack([zx + xz, zy + yz, 1.0 - trace + 2.0 * zz, yx - xy], axis=-1),
+            np.stack([zy - yz, xz - zx, yx - xy, 1.0 + trace], axis=-1),
+        ],
+        axis=-2,
+    )
+    largest = np.argmax(np.stack([xx, yy, zz, trace], axis=-1), axis=-1)
+    q = np.take_along_axis(formulae, largest[..., None, None], axis=-2)[..., 0, :]
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    return np.asarray(np.where(q[..., 3:] >= 0.0, q, -q))
 
 
 def pose_of(quaternion: FloatArray, translation_m: FloatArray) -> Pose:
