@@ -6,6 +6,7 @@ import numpy as np
 
 from hmt_service.core.geometry import FloatArray, Pose, inverse, planar_pose
 from hmt_service.core.types import OdometryReading, Reading, Scan
+from tests.core import factories
 
 # Two rooms, 8 m x 6 m each, and a door of 1 m between them: x0, y0, x1, y1 of every wall, m.
 WALLS = np.array(
@@ -29,16 +30,7 @@ SETTINGS = "areas: {max_cut: 0.8}"
 
 def ranges_from(world_from_body: Pose, bearings_rad: FloatArray) -> FloatArray:
     """Return the distance to the nearest wall along every bearing, in closed form."""
-    angles = np.arctan2(world_from_body[1, 0], world_from_body[0, 0]) + bearings_rad
-    rays = np.stack([np.cos(angles), np.sin(angles)], axis=1)[:, None]
-    starts = WALLS[:, :2] - world_from_body[:2, 3]
-    along = WALLS[:, 2:] - WALLS[:, :2]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        determinant = rays[..., 0] * along[:, 1] - rays[..., 1] * along[:, 0]
-        ranges = (starts[:, 0] * along[:, 1] - starts[:, 1] * along[:, 0]) / determinant
-        shares = (starts[:, 0] * rays[..., 1] - starts[:, 1] * rays[..., 0]) / determinant
-    is_hit = (ranges > 0.0) & (shares >= 0.0) & (shares <= 1.0)
-    return np.asarray(np.where(is_hit, ranges, np.inf).min(axis=1))
+    return factories.ranges_from(WALLS, world_from_body, bearings_rad)
 
 
 def path(scans: int) -> list[Pose]:

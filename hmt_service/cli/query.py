@@ -10,7 +10,6 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
 import typer
 
 from hmt_service.cli.connection import Connect, Json, Robot, Site, Timeout
@@ -261,11 +260,11 @@ def _areas_table(answer: GlobalMap) -> Table:
 def _pose(gaussian: GaussianPose) -> str:
     """Return position and heading with their standard deviations."""
     x, y, z = gaussian.mean[:3, 3]
-    # Tangent order [rotation, translation]; the largest axis of the position's ellipsoid.
-    sigma_m = math.sqrt(max(0.0, float(np.linalg.eigvalsh(gaussian.covariance[3:, 3:])[-1])))
     sigma_deg = math.degrees(math.sqrt(max(0.0, gaussian.covariance[2, 2])))
     yaw_deg = math.degrees(yaw_of(gaussian.mean))
-    return f"({x:.3f}, {y:.3f}, {z:.3f}) ±{sigma_m:.3f} m, {yaw_deg:.2f} ±{sigma_deg:.2f} deg"
+    return (
+        f"({x:.3f}, {y:.3f}, {z:.3f}) ±{gaussian.sigma_m:.3f} m, {yaw_deg:.2f} ±{sigma_deg:.2f} deg"
+    )
 
 
 def _path(areas: tuple[int, ...], *, shown: int = 12) -> str:

@@ -19,9 +19,11 @@ from hmt_service.core.geometry import (
     GaussianPose,
     Pose,
     inverse,
+    isotropic_covariance,
     log,
     planar_covariance,
     planar_pose,
+    skew,
     transform_points,
     yaw_of,
 )
@@ -98,7 +100,9 @@ class Aligner:
             match.information, sigma_m=self._covariance.sigma_submap_m, is_planar=self._is_planar
         )
         floor = self._covariance
-        covariance += np.diag([floor.floor_submap_rad**2] * 3 + [floor.floor_submap_m**2] * 3)
+        covariance += isotropic_covariance(
+            sigma_rad=floor.floor_submap_rad, sigma_m=floor.floor_submap_m
+        )
         if self._is_planar:
             covariance = planar_covariance(covariance)
         return Mode(GaussianPose(pose, covariance), match.inlier_share)
@@ -199,10 +203,7 @@ class Aligner:
         return poses
 
     def _is_in_gate(self, mode: Mode, prior: GaussianPose) -> bool:
-        together = GaussianPose(prior.mean, prior.covariance + mode.target_from_visit.covariance)
-        return (
-            together.mahalanobis2(mode.target_from_visit.mean) <= self._config.gate_sigma**2 + 6.0
-        )
+        return prior.disagreement2(mode.target_from_visit) <= self._config.gate_sigma**2 + 6.0
 
     def _distinct(self, modes: list[Mode]) -> tuple[Mode, ...]:
         """Return one mode per basin: a corridor of equally good poses is a single one."""
@@ -243,10 +244,9 @@ def _separate_peaks(
 
 
 def _are_apart(first: GaussianPose, second: GaussianPose) -> bool:
-    together = GaussianPose(first.mean, first.covariance + second.covariance)
     xi = log(inverse(first.mean) @ second.mean)
     is_far = np.linalg.norm(xi[3:]) > _SEPARATION_M or np.linalg.norm(xi[:3]) > _SEPARATION_RAD
-    return bool(is_far and together.mahalanobis2(second.mean) > _SEPARATION_SIGMA**2)
+    return bool(is_far and first.disagreement2(second) > _SEPARATION_SIGMA**2)
 
 
 def _position_covariance(pose: GaussianPose, point: FloatArray) -> FloatArray:
@@ -254,8 +254,5 @@ def _position_covariance(pose: GaussianPose, point: FloatArray) -> FloatArray:
 
     To first order `d(T p) = R (rho - p x phi)`; only the horizontal part counts for the search.
     """
-    skew = np.array(
-        [[0.0, -point[2], point[1]], [point[2], 0.0, -point[0]], [-point[1], point[0], 0.0]]
-    )
-    jacobian = pose.mean[:3, :3] @ np.hstack([-skew, np.eye(3)])
+    jacobian = pose.mean[:3, :3] @ np.hstack([-skew(point), np.eye(3)])
     return np.asarray((jacobian @ pose.covariance @ jacobian.T)[:2, :2])

@@ -276,7 +276,7 @@ class Engine:
             reference_from_keyframe=best.graph.relative(0, visit.visit) @ visit_from_keyframe,
             reference_area=0,
             areas=len(best.areas),
-            arcs=len(arcs_of(best, self._motions)),
+            arcs=best.arcs,
             keyframes=visit.last_keyframe + 1,
         )
 
@@ -437,11 +437,10 @@ _NO_POINTS: Points = np.zeros((0, 3), dtype=np.float32)
 
 
 def _lost(keyframe: Keyframe, failure: TrackingFailure) -> Event:
-    covariance = keyframe.previous_from_body.covariance
     numbers = {
         "keyframe": float(keyframe.index),
-        "sigma_m": float(np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1])),
-        "sigma_rad": float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])),
+        "sigma_m": keyframe.previous_from_body.sigma_m,
+        "sigma_rad": keyframe.previous_from_body.sigma_rad,
     }
     message = f"keyframe {keyframe.index} was not registered ({failure}): a new area begins"
     return Event(EventKind.LOST, keyframe.stamp_s, message, numbers)
@@ -463,13 +462,9 @@ def _difference(area: int, consistent: GaussianPose, shortest: GaussianPose) -> 
         area=area,
         translation_m=float(np.linalg.norm(consistent.mean[:3, 3] - shortest.mean[:3, 3])),
         rotation_rad=float(np.linalg.norm(apart[:3])),
-        sigma_consistent_m=_largest_sigma_m(consistent),
-        sigma_shortest_path_m=_largest_sigma_m(shortest),
+        sigma_consistent_m=consistent.sigma_m,
+        sigma_shortest_path_m=shortest.sigma_m,
     )
-
-
-def _largest_sigma_m(pose: GaussianPose) -> float:
-    return float(np.sqrt(max(np.linalg.eigvalsh(pose.covariance[3:, 3:])[-1], 0.0)))
 
 
 def _stored(hypothesis: Hypothesis) -> StoredHypothesis:

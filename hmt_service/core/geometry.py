@@ -67,7 +67,7 @@ def transform_points(a_from_b: Pose, points_in_b: npt.NDArray[np.floating]) -> F
     return np.asarray(points_in_b @ a_from_b[:3, :3].T + a_from_b[:3, 3], dtype=np.float64)
 
 
-def _skew(v: FloatArray) -> FloatArray:
+def skew(v: FloatArray) -> FloatArray:
     """Return the cross-product matrices of vectors, shape (..., 3) -> (..., 3, 3)."""
     result = np.zeros((*v.shape[:-1], 3, 3))
     result[..., 0, 1], result[..., 0, 2] = -v[..., 2], v[..., 1]
@@ -86,7 +86,7 @@ def exp(xi: FloatArray) -> FloatArray:
     a = np.where(is_small, 1.0, np.sin(safe) / safe)
     b = np.where(is_small, 0.5, (1.0 - np.cos(safe)) / safe**2)
     c = np.where(is_small, 1.0 / 6.0, (safe - np.sin(safe)) / safe**3)
-    k = _skew(phi)
+    k = skew(phi)
     kk = k @ k
     result = np.zeros((*xi.shape[:-1], 4, 4))
     result[..., :3, :3] = np.eye(3) + a * k + b * kk
@@ -105,7 +105,7 @@ def log(pose: FloatArray) -> FloatArray:
     phi = vector * np.where(is_small, 2.0, angle / np.where(is_small, 1.0, half_sine))
     is_small, safe = is_small[..., None], np.where(is_small, 1.0, angle)[..., None]
     b = np.where(is_small, 1.0 / 12.0, (1.0 - 0.5 * safe / np.tan(0.5 * safe)) / safe**2)
-    k = _skew(phi)
+    k = skew(phi)
     inverse_jacobian = np.eye(3) - 0.5 * k + b * (k @ k)
     rho = (inverse_jacobian @ pose[..., :3, 3, None])[..., 0]
     return np.concatenate([phi, rho], axis=-1)
@@ -157,13 +157,18 @@ def adjoint(pose: Pose) -> FloatArray:
     rotation = pose[:3, :3]
     result[:3, :3] = rotation
     result[3:, 3:] = rotation
-    result[3:, :3] = _skew(pose[:3, 3]) @ rotation
+    result[3:, :3] = skew(pose[:3, 3]) @ rotation
     return result
 
 
 def symmetric(matrix: FloatArray) -> FloatArray:
     """Return the symmetric part: rounding must not make a covariance asymmetric."""
     return 0.5 * (matrix + matrix.T)
+
+
+def isotropic_covariance(*, sigma_rad: float, sigma_m: float) -> FloatArray:
+    """Return the covariance with these deviations about and along every axis, shape (6, 6)."""
+    return np.diag([sigma_rad**2] * 3 + [sigma_m**2] * 3)
 
 
 def planar_covariance(covariance: FloatArray, *, off_plane_sigma: float = 1e-4) -> FloatArray:
@@ -207,6 +212,21 @@ class GaussianPose:
         covariance = symmetric(np.linalg.inv(own + theirs))
         step = covariance @ theirs @ log(inverse(self.mean) @ other.mean)
         return GaussianPose(self.mean @ exp(step), covariance)
+
+    @property
+    def sigma_rad(self) -> float:
+        """Standard deviation of the rotation about its least known axis, rad."""
+        return float(np.sqrt(max(np.linalg.eigvalsh(self.covariance[:3, :3])[-1], 0.0)))
+
+    @property
+    def sigma_m(self) -> float:
+        """Standard deviation of the translation along its least known axis, m."""
+        return float(np.sqrt(max(np.linalg.eigvalsh(self.covariance[3:, 3:])[-1], 0.0)))
+
+    def disagreement2(self, other: GaussianPose) -> float:
+        """Return the squared Mahalanobis distance of two independent beliefs from each other."""
+        together = GaussianPose(self.mean, self.covariance + other.covariance)
+        return together.mahalanobis2(other.mean)
 
     def mahalanobis2(self, pose: Pose) -> float:
         """Return the squared Mahalanobis distance of `pose` from this Gaussian."""

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -61,6 +62,11 @@ class Hypothesis:
     def areas(self) -> tuple[int, ...]:
         """All areas, in the order of their identifiers."""
         return tuple(a.area for a in self.assignments if a.area_from_visit is None)
+
+    @property
+    def arcs(self) -> int:
+        """Number of pairs of areas that the robot has gone between directly."""
+        return len({frozenset(pair) for pair in pairwise(self.topological_path)})
 
     def visits_to(self, area: int) -> tuple[int, ...]:
         """Return the visits to an area, in time order."""

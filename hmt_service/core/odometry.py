@@ -21,6 +21,7 @@ from hmt_service.core.geometry import (
     exp,
     identity,
     inverse,
+    isotropic_covariance,
     log,
     planar_covariance,
     project_planar,
@@ -154,7 +155,7 @@ class Odometry:
     def _lost(self, mean: Pose, elapsed_s: float) -> GaussianPose:
         """Return a pose that is bounded by the robot's speed only."""
         sigma_m = min(self._motion.max_speed_m_s * elapsed_s, _LOST_M)
-        covariance = np.diag([_LOST_RAD**2] * 3 + [sigma_m**2] * 3)
+        covariance = isotropic_covariance(sigma_rad=_LOST_RAD, sigma_m=sigma_m)
         if self._sensor.is_planar:
             covariance = planar_covariance(covariance)
         return GaussianPose(mean, covariance)
@@ -197,7 +198,7 @@ class Odometry:
         )
         sigma_rad = min(sigma_rad, _LOST_RAD)
         sigma_m = factor * (noise.sigma_floor_m * scans + noise.sigma_translation_share * travelled)
-        covariance = np.diag([sigma_rad**2] * 3 + [sigma_m**2] * 3)
+        covariance = isotropic_covariance(sigma_rad=sigma_rad, sigma_m=sigma_m)
         if self._sensor.is_planar:
             covariance = planar_covariance(covariance)
         return self._keyframe_from_body @ GaussianPose(motion, covariance), motion
@@ -267,7 +268,7 @@ class Odometry:
 
     def _floor(self) -> FloatArray:
         floor = self._covariance
-        return np.diag([floor.floor_rad**2] * 3 + [floor.floor_m**2] * 3)
+        return isotropic_covariance(sigma_rad=floor.floor_rad, sigma_m=floor.floor_m)
 
     def _add_keyframe(
         self,

@@ -91,13 +91,9 @@ class Refinement:
         return [other for _, _, other in sorted(near)[: self._config.max_neighbours]]
 
     def _is_certain(self, prior: GaussianPose) -> bool:
-        sigma_rad, sigma_m = (
-            float(np.sqrt(np.linalg.eigvalsh(block)[-1]))
-            for block in (prior.covariance[:3, :3], prior.covariance[3:, 3:])
-        )
-        return sigma_m <= self._config.max_sigma_m and sigma_rad <= self._config.max_sigma_rad
+        config = self._config
+        return prior.sigma_m <= config.max_sigma_m and prior.sigma_rad <= config.max_sigma_rad
 
     @staticmethod
     def _agrees(prior: GaussianPose, mode: Mode) -> bool:
-        together = prior.covariance + mode.target_from_visit.covariance
-        return GaussianPose(prior.mean, together).mahalanobis2(mode.target_from_visit.mean) <= _GATE
+        return prior.disagreement2(mode.target_from_visit) <= _GATE

@@ -107,10 +107,9 @@ class Transition:
             target = visits[area]
             prior = hypothesis.graph.relative(area, arc.visit_a) @ arc.a_from_b
             offset = transform_points(prior.mean, visit.centre[None])[0] - target.centre
-            sigma_m = float(np.sqrt(np.linalg.eigvalsh(prior.covariance[3:, 3:])[-1]))
             margin = self._config.margin_share * target.reach_m
             distance = float(np.linalg.norm(offset)) - target.radius_m - visit.radius_m - margin
-            if distance <= self._gate_sigma * sigma_m:
+            if distance <= self._gate_sigma * prior.sigma_m:
                 result.append(_Candidate(area, prior, distance))
         result.sort(key=lambda candidate: (candidate.distance_m, candidate.area))
         return result[: self._config.max_candidates]
