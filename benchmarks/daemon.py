@@ -98,7 +98,7 @@ def _readings(run: Run, config: Config) -> tuple[str, tuple[Reading, ...], tuple
         return _LOG, first_scans(read_recorded(path, config), scans), ()
     # Ray casting loads slowly, and only this branch needs it.
     from hmt_service.sim.simulation import simulate
-    from hmt_service.sim.worlds import office
+    from hmt_service.sim.worlds.office import office
 
     run.say("simulating an office")
     readings = first_scans(simulate(office(0), 0).readings, scans)

@@ -45,7 +45,7 @@ def demo(
     from hmt_service.service.client import HmtClient
     from hmt_service.service.results import TRAJECTORY
     from hmt_service.sim.simulation import simulate
-    from hmt_service.sim.worlds import office
+    from hmt_service.sim.worlds.office import office
 
     console = Console()
     with console.status("simulating an office building"):

@@ -12,7 +12,7 @@ import numpy as np
 
 from hmt_service.core.geometry import FloatArray
 from hmt_service.errors import Unavailable
-from hmt_service.sim.worlds import World
+from hmt_service.sim.worlds.world import World
 
 try:
     import open3d as o3d

@@ -14,7 +14,7 @@ from hmt_service.core.types import Reading, StampedPose
 from hmt_service.sim.raycasting import RayCaster
 from hmt_service.sim.sensors import Laser2d, WheelOdometry
 from hmt_service.sim.trajectories import PathFollower
-from hmt_service.sim.worlds import World
+from hmt_service.sim.worlds.world import World
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,7 +45,7 @@ def simulate(
         odometry: What its wheels say; None: several metres of drift over an office.
     """
     laser_rng, odometry_rng = np.random.default_rng(seed).spawn(2)
-    truth = (follower or PathFollower()).drive(world.route_m)
+    truth = (follower or PathFollower()).drive(world.route_m[:, :2])
     scans = (laser or Laser2d()).observe(RayCaster(world), truth, laser_rng)
     wheels = (odometry or WheelOdometry()).observe(truth, odometry_rng)
     readings = (reading for pair in zip(wheels, scans, strict=True) for reading in pair)

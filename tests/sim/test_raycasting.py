@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from hmt_service.sim.raycasting import RayCaster
-from hmt_service.sim.worlds import World
+from hmt_service.sim.worlds.world import World
 
 # One square wall of 10 m x 10 m at x = 4 m.
 WALL = World(
     "wall",
     np.array([[4, -5, -5], [4, 5, -5], [4, 5, 5], [4, -5, 5]], dtype=np.float32),
     np.array([[0, 1, 2], [0, 2, 3]], dtype=np.uint32),
-    np.array([[0.0, 0.0], [1.0, 0.0]]),
+    np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]),
 )
 
 

@@ -10,14 +10,14 @@ from hmt_service.core.geometry import inverse, planar_pose, transform_points, ya
 from hmt_service.core.types import StampedPose
 from hmt_service.sim.raycasting import RayCaster
 from hmt_service.sim.sensors import Laser2d, WheelOdometry
-from hmt_service.sim.worlds import World
+from hmt_service.sim.worlds.world import World
 
 # One wall of 200 m x 2 m at y = 5 m.
 WALL = World(
     "wall",
     np.array([[-100, 5, -1], [100, 5, -1], [100, 5, 1], [-100, 5, 1]], dtype=np.float32),
     np.array([[0, 1, 2], [0, 2, 3]], dtype=np.uint32),
-    np.array([[0.0, 0.0], [1.0, 0.0]]),
+    np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]),
 )
 PERFECT_WHEELS = WheelOdometry(
     scale=1.0,

@@ -10,7 +10,8 @@ from hmt_service.core.types import OdometryReading, Reading, Scan
 from hmt_service.sim.raycasting import RayCaster
 from hmt_service.sim.sensors import Laser2d
 from hmt_service.sim.simulation import Simulation, simulate
-from hmt_service.sim.worlds import World, office
+from hmt_service.sim.worlds.office import office
+from hmt_service.sim.worlds.world import World
 
 
 @cache

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hmt_service.sim.worlds import office
+from hmt_service.sim.worlds.office import office
 
 
 def test_same_seed_draws_the_same_world() -> None:
@@ -23,8 +23,8 @@ def test_route_is_long_and_keeps_inside_the_building(seed: int) -> None:
     world = office(seed)
     length = np.linalg.norm(np.diff(world.route_m, axis=0), axis=1).sum()
     assert 150.0 < length < 230.0
-    assert np.all(world.route_m > world.vertices[:, :2].min(axis=0))
-    assert np.all(world.route_m < world.vertices[:, :2].max(axis=0))
+    assert np.all(world.route_m[:, :2] > world.vertices[:, :2].min(axis=0))
+    assert np.all(world.route_m[:, :2] < world.vertices[:, :2].max(axis=0))
 
 
 def test_route_passes_the_first_junction_three_times() -> None:

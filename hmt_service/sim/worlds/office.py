@@ -1,6 +1,4 @@
-"""Simulated buildings: a triangle mesh and a route through it, drawn from a seed.
-
-The world frame has its floor at z = 0; x points east, y north.
+"""An office floor: rooms on both sides of a ring of corridors.
 
 References:
     own.
@@ -13,51 +11,16 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-import numpy.typing as npt
 
-from hmt_service.core.geometry import FloatArray
+from hmt_service.sim.worlds.plan import Box, mesh_of, wall_along_x, wall_along_y
+from hmt_service.sim.worlds.world import World
 
-_WALL_M = 0.15
-_CEILING_M = 2.5
 _CORRIDOR_M = 2.2
 _DOOR_M = 1.1
 _REACH_M = 2.4
 """How far the route goes into a room, measured from its door."""
 _CLEARANCE_M = 0.8
 """Space kept free of furniture around the route."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class World:
-    """What a simulated sensor can see, and where the robot drives."""
-
-    name: str
-    """Kind of world and the seed that it was drawn from."""
-    vertices: npt.NDArray[np.float32]
-    """Corners of the mesh in the world frame, shape (V, 3), m."""
-    triangles: npt.NDArray[np.uint32]
-    """Rows of `vertices` that span each triangle, shape (T, 3)."""
-    route_m: FloatArray
-    """Waypoints in the plane, shape (W, 2), m; straight lines between them are free."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Box:
-    """An upright box on the floor, all in m."""
-
-    x_min: float
-    y_min: float
-    x_max: float
-    y_max: float
-    height: float = _CEILING_M
-
-    def overlaps(self, other: _Box) -> bool:
-        return (
-            self.x_min < other.x_max
-            and other.x_min < self.x_max
-            and self.y_min < other.y_max
-            and other.y_min < self.y_max
-        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,15 +59,15 @@ def office(seed: int) -> World:
     for x_min, x_max in blocks:
         rows.append(_Row(x_min, x_max, inner_south, rng.uniform(4.5, 6.0)))
         rows.append(_Row(x_min, x_max, inner_north, -rng.uniform(4.5, 6.0)))
-    boxes: list[_Box] = []
+    boxes: list[Box] = []
     doors: list[tuple[float, _Row]] = []
     for row in rows:
         for door_x, parts in _rooms(row, rng):
             boxes += parts
             doors.append((door_x, row))
 
-    boxes += [_wall_along_y(x, 0.0, height) for x in (0.0, width)]
-    boxes += [_wall_along_y(x, inner_south, inner_north) for block in blocks for x in block]
+    boxes += [wall_along_y(x, 0.0, height) for x in (0.0, width)]
+    boxes += [wall_along_y(x, inner_south, inner_north) for block in blocks for x in block]
     # Without cabinets, the places along a corridor without doors would all look alike.
     for x in (west, middle, east):
         boxes += _cabinets(x, inner_south, inner_north, rng)
@@ -125,8 +88,8 @@ def office(seed: int) -> World:
             inside = row.door_y + np.copysign(_REACH_M, row.depth)
             route += [(door_x, y_from), (door_x, inside), (door_x, y_from)]
         route.append((x_to, y_to))
-    vertices, triangles = _mesh(boxes)
-    return World(f"office-{seed}", vertices, triangles, np.array(route))
+    vertices, triangles = mesh_of(boxes)
+    return World(f"office-{seed}", vertices, triangles, np.array([(x, y, 0.0) for x, y in route]))
 
 
 def _beside(
@@ -143,7 +106,7 @@ def _beside(
     ]
 
 
-def _rooms(row: _Row, rng: np.random.Generator) -> Iterator[tuple[float, list[_Box]]]:
+def _rooms(row: _Row, rng: np.random.Generator) -> Iterator[tuple[float, list[Box]]]:
     """Yield the middle of the door (x, m), the walls and the furniture of each room of a row."""
     length = row.x_max - row.x_min
     shares = rng.uniform(0.8, 1.2, max(2, round(length / 4.6)))
@@ -152,7 +115,7 @@ def _rooms(row: _Row, rng: np.random.Generator) -> Iterator[tuple[float, list[_B
     y_low, y_high = sorted((row.door_y, y_back))
     for left, right in pairwise(edges.tolist()):
         door_x = rng.uniform(left + 1.0, right - 1.0)
-        lane = _Box(
+        lane = Box(
             door_x - _CLEARANCE_M,
             row.door_y - _REACH_M - _CLEARANCE_M,
             door_x + _CLEARANCE_M,
@@ -162,11 +125,11 @@ def _rooms(row: _Row, rng: np.random.Generator) -> Iterator[tuple[float, list[_B
         yield (
             door_x,
             [
-                _wall_along_x(left, door_x - _DOOR_M / 2, row.door_y),
-                _wall_along_x(door_x + _DOOR_M / 2, right, row.door_y),
-                _wall_along_x(left, right, y_back),
-                _wall_along_y(left, y_low, y_high),
-                _wall_along_y(right, y_low, y_high),
+                wall_along_x(left, door_x - _DOOR_M / 2, row.door_y),
+                wall_along_x(door_x + _DOOR_M / 2, right, row.door_y),
+                wall_along_x(left, right, y_back),
+                wall_along_y(left, y_low, y_high),
+                wall_along_y(right, y_low, y_high),
                 *(box for box in furniture if not box.overlaps(lane)),
             ],
         )
@@ -174,18 +137,18 @@ def _rooms(row: _Row, rng: np.random.Generator) -> Iterator[tuple[float, list[_B
 
 def _furniture(
     left: float, right: float, y_low: float, y_high: float, rng: np.random.Generator
-) -> list[_Box]:
+) -> list[Box]:
     """Draw desks and cupboards anywhere inside a room."""
     boxes = []
     for _ in range(rng.integers(4, 8)):
         size_x, size_y = rng.uniform(0.4, 1.5, 2)
         x = rng.uniform(left, right - size_x)
         y = rng.uniform(y_low, y_high - size_y)
-        boxes.append(_Box(x, y, x + size_x, y + size_y, rng.uniform(0.7, 2.0)))
+        boxes.append(Box(x, y, x + size_x, y + size_y, rng.uniform(0.7, 2.0)))
     return boxes
 
 
-def _cabinets(x: float, y_min: float, y_max: float, rng: np.random.Generator) -> list[_Box]:
+def _cabinets(x: float, y_min: float, y_max: float, rng: np.random.Generator) -> list[Box]:
     """Draw shallow cabinets along both walls of a corridor that runs along y at `x`."""
     boxes = []
     for side in (-1.0, 1.0):
@@ -193,32 +156,5 @@ def _cabinets(x: float, y_min: float, y_max: float, rng: np.random.Generator) ->
             length, depth = rng.uniform(0.5, 1.6), rng.uniform(0.15, 0.4)
             y = rng.uniform(y_min, y_max - length)
             wall, front = sorted((x + side * _CORRIDOR_M / 2, x + side * (_CORRIDOR_M / 2 - depth)))
-            boxes.append(_Box(wall, y, front, y + length, 1.2))
+            boxes.append(Box(wall, y, front, y + length, 1.2))
     return boxes
-
-
-def _wall_along_x(x_min: float, x_max: float, y: float) -> _Box:
-    half = _WALL_M / 2
-    return _Box(x_min, y - half, x_max, y + half)
-
-
-def _wall_along_y(x: float, y_min: float, y_max: float) -> _Box:
-    half = _WALL_M / 2
-    return _Box(x - half, y_min - half, x + half, y_max + half)
-
-
-# A unit box: bit 0 of a corner's number is x, bit 1 is y, bit 2 is z.
-_CORNERS = np.array([[i & 1, i >> 1 & 1, i >> 2] for i in range(8)], dtype=np.float64)
-_QUADS = ((0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5))
-_FACES = np.array([face for a, b, c, d in _QUADS for face in ((a, b, c), (a, c, d))])
-
-
-def _mesh(
-    boxes: Sequence[_Box],
-) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.uint32]]:
-    """Return the vertices, shape (8 B, 3), and triangles, shape (12 B, 3), of B boxes."""
-    low = np.array([(box.x_min, box.y_min, 0.0) for box in boxes])
-    high = np.array([(box.x_max, box.y_max, box.height) for box in boxes])
-    vertices = low[:, None] + _CORNERS * (high - low)[:, None]
-    triangles = _FACES + 8 * np.arange(len(boxes))[:, None, None]
-    return vertices.reshape(-1, 3).astype(np.float32), triangles.reshape(-1, 3).astype(np.uint32)

@@ -1,0 +1,1 @@
+"""Families of simulated worlds, one module each."""
