@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from enum import StrEnum
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import Annotated
 
@@ -20,6 +21,7 @@ from rich.status import Status
 from rich.table import Table
 from rich.text import Text
 
+from benchmarks.cells import Cells, code_fingerprint
 from benchmarks.metric import (
     Comparison,
     Direction,
@@ -44,30 +46,27 @@ _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS
 
 
 class Name(StrEnum):
-    """What can be measured."""
+    """What can be measured; each is the module of its name."""
 
     ACCURACY = "accuracy"
-    DAEMON = "daemon"
+    BELIEF = "belief"
+    TABLE2 = "table2"
+    PEERS = "peers"
+    SCALING = "scaling"
+    LATENCY = "latency"
 
 
-# The benchmarks load numpy, which reads the number of its threads only once: `main` sets it before.
-def _accuracy(run: Run) -> Report:
-    from benchmarks.accuracy import measure
-
-    return measure(run)
-
-
-def _daemon(run: Run) -> Report:
-    from benchmarks.daemon import measure
-
-    return measure(run)
+def _measure_in_module(name: Name, run: Run) -> Report:
+    # The benchmarks load numpy, which reads the number of its threads only once: `main` sets it
+    # before.
+    report: Report = import_module(f"benchmarks.{name}").measure(run)
+    return report
 
 
 REGISTRY: dict[Name, Callable[[Run], Report]] = {
-    Name.ACCURACY: _accuracy,
-    Name.DAEMON: _daemon,
+    name: partial(_measure_in_module, name) for name in Name
 }
-"""Every benchmark; a new one is a module with `measure`, a name and a line here."""
+"""Every benchmark; a new one is a module with `measure` and a name above."""
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 
@@ -85,11 +84,14 @@ def run_benchmarks(
         bool, typer.Option("--update-baseline", help="Make what is measured the baseline.")
     ] = False,
     baseline: Annotated[Path, typer.Option(help="File that holds the baseline.")] = BASELINE,
-    as_json: Annotated[
-        Path | None, typer.Option("--json", help="File to write the numbers to.")
-    ] = None,
+    out: Annotated[
+        Path, typer.Option(help="Folder for numbers and figures: OUT/quick or OUT/full.")
+    ] = Path("out/benchmarks"),
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on where an earlier run of this code stopped.")
+    ] = False,
 ) -> None:
-    """Measure the chain: accuracy on recorded logs, cost of the daemon.
+    """Measure the chain: how accurate, how true its beliefs, how fast, beside others.
 
     Exit codes: 0 done, 1 the gate failed, 2 wrong options or a benchmark could not run.
     """
@@ -98,17 +100,17 @@ def run_benchmarks(
     console = Console(width=None if Console().is_terminal else _WIDTH)
     chosen = list(dict.fromkeys(names or REGISTRY))
     mode = "quick" if quick else "full"
+    folder = _made(out / mode)
     # Of the values of other benchmarks nothing can be said.
     known = {
         key: value
         for key, value in read_baseline(baseline, mode).items()
         if key.split("/")[0] in chosen
     }
-    report = _measure(chosen, console, is_quick=quick)
+    report = _measure(chosen, console, folder, is_quick=quick, is_resumed=resume)
     comparisons = compare(report.metrics, known)
     _show(console, comparisons, report.skipped, mode)
-    if as_json is not None:
-        _write(as_json, mode, report)
+    console.print(f"numbers and {len(report.figures)} figures in {folder}", soft_wrap=True)
     if update:
         update_baseline(baseline, mode, report.metrics)
         console.print(f"{len(report.metrics)} values of mode {mode} in {baseline}", soft_wrap=True)
@@ -116,15 +118,31 @@ def run_benchmarks(
         raise typer.Exit(WORSE)
 
 
-def _measure(names: Sequence[Name], console: Console, *, is_quick: bool) -> Report:
-    metrics: list[Metric] = []
-    skipped: list[str] = []
+def _measure(
+    names: Sequence[Name], console: Console, folder: Path, *, is_quick: bool, is_resumed: bool
+) -> Report:
+    """Run the benchmarks one after the other; what each has measured is written at once."""
+    fingerprint = code_fingerprint()
+    reports = []
     for name in names:
+        cells = Cells(folder / "cells" / name, fingerprint, is_resumed)
         with console.status(name) as status:
-            report = REGISTRY[name](Run(is_quick, partial(_say, status, name)))
-        metrics += [replace(metric, key=f"{name}/{metric.key}") for metric in report.metrics]
-        skipped += [f"{name}/{sentence}" for sentence in report.skipped]
-    return Report(tuple(metrics), tuple(skipped))
+            report = REGISTRY[name](Run(is_quick, partial(_say, status, name), folder, cells))
+        reports.append(_named(name, report))
+        _write(folder / f"{name}.json", reports[-1])
+    return Report(
+        tuple(metric for report in reports for metric in report.metrics),
+        tuple(sentence for report in reports for sentence in report.skipped),
+        tuple(figure for report in reports for figure in report.figures),
+    )
+
+
+def _named(name: Name, report: Report) -> Report:
+    return Report(
+        tuple(replace(metric, key=f"{name}/{metric.key}") for metric in report.metrics),
+        tuple(f"{name}/{sentence}" for sentence in report.skipped),
+        report.figures,
+    )
 
 
 def _say(status: Status, name: Name, text: str) -> None:
@@ -203,11 +221,19 @@ def _passes(console: Console, comparisons: Sequence[Comparison]) -> bool:
     return is_passed
 
 
-def _write(path: Path, mode: str, report: Report) -> None:
+def _made(folder: Path) -> Path:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InvalidInput(f"cannot make the folder {folder}: {error.strerror}") from error
+    return folder
+
+
+def _write(path: Path, report: Report) -> None:
     document = {
-        "mode": mode,
         "metrics": [asdict(metric) for metric in report.metrics],
         "skipped": report.skipped,
+        "figures": [figure.name for figure in report.figures],
     }
     try:
         path.write_text(json.dumps(document, indent=2, allow_nan=False) + "\n")

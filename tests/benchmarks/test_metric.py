@@ -189,6 +189,11 @@ def measured(monkeypatch: pytest.MonkeyPatch) -> Measure:
     return put
 
 
+@pytest.fixture(autouse=True)
+def _in_a_folder_of_its_own(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
 def run(*arguments: str | Path, expected: int = 0) -> str:
     result = CliRunner().invoke(app, ["accuracy", *map(str, arguments)])
     assert result.exit_code == expected, result.output
@@ -239,17 +244,17 @@ def test_values_of_benchmarks_that_were_not_asked_for_are_left_alone(
     tmp_path: Path, measured: Measure
 ) -> None:
     baseline = tmp_path / "baseline.json"
-    update_baseline(baseline, "full", [metric(1.0, key="daemon/scans_lost")])
+    update_baseline(baseline, "full", [metric(1.0, key="latency/scans_lost")])
     measured(metric(2.0))
     assert "not in this run" not in run("--baseline", baseline, "--update-baseline")
-    assert set(read_baseline(baseline, "full")) == {"accuracy/error", "daemon/scans_lost"}
+    assert set(read_baseline(baseline, "full")) == {"accuracy/error", "latency/scans_lost"}
 
 
 def test_json_holds_every_number(tmp_path: Path, measured: Measure) -> None:
     measured(metric(2.0, rel_tol=None), skipped=("intel: no file",))
-    run("--baseline", tmp_path / "none", "--json", tmp_path / "out.json")
-    assert json.loads((tmp_path / "out.json").read_text()) == {
-        "mode": "full",
+    output = run("--baseline", tmp_path / "none", "--out", tmp_path / "results")
+    assert f"numbers and 0 figures in {tmp_path / 'results' / 'full'}" in output
+    assert json.loads((tmp_path / "results" / "full" / "accuracy.json").read_text()) == {
         "metrics": [
             {
                 "key": "accuracy/error",
@@ -260,7 +265,16 @@ def test_json_holds_every_number(tmp_path: Path, measured: Measure) -> None:
             }
         ],
         "skipped": ["accuracy/intel: no file"],
+        "figures": [],
     }
+
+
+def test_a_folder_that_cannot_be_made_is_named(tmp_path: Path, measured: Measure) -> None:
+    measured(metric(2.0))
+    (tmp_path / "file").touch()
+    result = CliRunner().invoke(app, ["accuracy", "--out", str(tmp_path / "file")])
+    assert isinstance(result.exception, InvalidInput)
+    assert "cannot make the folder" in str(result.exception)
 
 
 def test_without_recorded_logs_accuracy_is_skipped_with_the_reason(
