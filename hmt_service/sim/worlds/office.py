@@ -12,11 +12,20 @@ from itertools import pairwise
 
 import numpy as np
 
-from hmt_service.sim.worlds.plan import Box, mesh_of, wall_along_x, wall_along_y
+from hmt_service.sim.worlds.plan import (
+    Box,
+    ceiling,
+    floor,
+    mesh_of,
+    wall_along_x,
+    wall_along_y,
+)
 from hmt_service.sim.worlds.world import World
 
 _CORRIDOR_M = 2.2
 _DOOR_M = 1.1
+_OUTER_DEPTH_M = 4.5
+"""Depth of the rooms along the outer walls."""
 _REACH_M = 2.4
 """How far the route goes into a room, measured from its door."""
 _CLEARANCE_M = 0.8
@@ -35,14 +44,15 @@ class _Row:
     """From the door wall to the back wall; negative where the rooms lie to the south of it."""
 
 
-def office(seed: int) -> World:
+def office(seed: int, laps: int = 1) -> World:
     """Draw an office floor: a ring of corridors, one across its middle, rooms on both sides.
 
     The route of about 200 m runs the eastern loop, the western loop and most of the eastern loop
-    again, and enters one room in each corridor with doors (the same room on the second pass).
+    again, and enters one room in each corridor with doors (the same room on every pass).
 
     Args:
         seed: The same seed gives the same world.
+        laps: How often both loops are driven before the last part of the route, 1 or more.
     """
     rng = np.random.default_rng(seed)
     width, height = rng.uniform(28.0, 32.0), rng.uniform(18.0, 21.0)
@@ -55,7 +65,10 @@ def office(seed: int) -> World:
         (middle + _CORRIDOR_M / 2, width - _CORRIDOR_M),
     )
 
-    rows = [_Row(0.0, width, 0.0, -4.5), _Row(0.0, width, height, 4.5)]
+    rows = [
+        _Row(0.0, width, 0.0, -_OUTER_DEPTH_M),
+        _Row(0.0, width, height, _OUTER_DEPTH_M),
+    ]
     for x_min, x_max in blocks:
         rows.append(_Row(x_min, x_max, inner_south, rng.uniform(4.5, 6.0)))
         rows.append(_Row(x_min, x_max, inner_north, -rng.uniform(4.5, 6.0)))
@@ -80,7 +93,7 @@ def office(seed: int) -> World:
     start, junction = (middle, south), (middle, north)
     eastern_loop = [start, (east, south), (east, north), junction]
     western_loop = [start, (west, south), (west, north), junction]
-    corners = [*eastern_loop, *western_loop, *eastern_loop[:3]]
+    corners = [*(eastern_loop + western_loop) * laps, *eastern_loop[:3]]
     route = [start]
     for (x_from, y_from), (x_to, y_to) in pairwise(corners):
         if y_from == y_to:
@@ -88,7 +101,8 @@ def office(seed: int) -> World:
             inside = row.door_y + np.copysign(_REACH_M, row.depth)
             route += [(door_x, y_from), (door_x, inside), (door_x, y_from)]
         route.append((x_to, y_to))
-    vertices, triangles = mesh_of(boxes)
+    building = Box(0.0, -_OUTER_DEPTH_M, width, height + _OUTER_DEPTH_M)
+    vertices, triangles = mesh_of([*boxes, floor(building), ceiling(building)])
     return World(f"office-{seed}", vertices, triangles, np.array([(x, y, 0.0) for x, y in route]))
 
 
