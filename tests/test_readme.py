@@ -8,6 +8,7 @@ import typer.main
 
 from hmt_service.cli.app import app
 from hmt_service.core.config import Config, Preset
+from hmt_service.io.foxglove import Defect
 from hmt_service.service.keys import Call, Control, Input, Topic
 from hmt_service.service.readings import Refusal
 
@@ -43,8 +44,8 @@ def test_every_key_is_in_the_key_table(
     assert documented == set(names)
 
 
-@pytest.mark.parametrize("reason", Refusal)
-def test_every_reason_of_refusal_is_documented(reason: Refusal) -> None:
+@pytest.mark.parametrize("reason", [*Refusal, *Defect])
+def test_every_reason_of_refusal_is_documented(reason: Refusal | Defect) -> None:
     assert f"`{reason}`" in README
 
 

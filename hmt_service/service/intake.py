@@ -12,9 +12,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from hmt_service.core.config import SensorConfig
+from hmt_service.core.ordering import ReorderWindow
 from hmt_service.core.types import Reading
+from hmt_service.io.foxglove import Decoded, Defect
 from hmt_service.runtime.messages import Finish
-from hmt_service.runtime.ordering import ReorderWindow
 from hmt_service.runtime.queues import SizedQueue
 from hmt_service.service.keys import Input
 from hmt_service.service.readings import Refusal, decode_reading
@@ -80,8 +81,8 @@ class Intake:
         self._received = 0
         self._accepted = 0
         self._discarded = 0
-        self._refused: Counter[Refusal] = Counter()
-        self._dropped_beams: Counter[Refusal] = Counter()
+        self._refused: Counter[Refusal | Defect] = Counter()
+        self._dropped_beams: Counter[Defect] = Counter()
 
     def start(self) -> None:
         """Start to hand readings on."""
@@ -136,7 +137,7 @@ class Intake:
         with self._lock:
             # Taken at first, and dropped once the next reading had shown the stamp to be wrong.
             jumped = self._window.refuted
-            refused = self._refused + Counter({Refusal.TIME_JUMPED: jumped})
+            refused = self._refused + Counter({Defect.TIME_JUMPED: jumped})
             accepted = self._accepted - jumped
             return InputCounts(
                 received=self._received,
@@ -170,13 +171,14 @@ class Intake:
 
     def _take(self, sample: _Sample) -> tuple[Reading, ...]:
         decoded = decode_reading(sample.name, sample.payload, sample.encoding, self._sensor)
-        if isinstance(decoded, Refusal):
-            released, refusal = None, decoded
-        else:
-            released, refusal = self._window.push(decoded.reading), Refusal.TIME_BACKWARDS
+        if not isinstance(decoded, Decoded):
+            with self._lock:
+                self._refused[decoded] += 1
+            return ()
+        released = self._window.push(decoded.reading)
         with self._lock:
-            if released is None or isinstance(decoded, Refusal):
-                self._refused[refusal] += 1
+            if released is None:
+                self._refused[Defect.TIME_BACKWARDS] += 1
                 return ()
             self._accepted += 1
             self._dropped_beams.update(decoded.dropped_beams)

@@ -1,4 +1,4 @@
-"""Factories of the service's tests: messages, and real daemons on loopback."""
+"""Factories of the service's tests: real daemons on loopback."""
 
 from __future__ import annotations
 
@@ -6,35 +6,17 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-from foxglove_schemas_protobuf.LaserScan_pb2 import LaserScan
-from google.protobuf.timestamp_pb2 import Timestamp
-
-from hmt_service.core.geometry import FloatArray
 from hmt_service.errors import Unavailable
 from hmt_service.service.client import HmtClient
 from hmt_service.service.reports import DaemonState
 from tests.flat import SETTINGS
 
 DEADLINE_S = 20.0
-
-
-def laser_scan(ranges: Sequence[float] | FloatArray, *, stamp_s: float = 0.0) -> LaserScan:
-    """Return a full turn of ranges as foxglove message."""
-    count = len(ranges)
-    seconds = int(stamp_s)
-    return LaserScan(
-        timestamp=Timestamp(seconds=seconds, nanos=int((stamp_s - seconds) * 1e9)),
-        frame_id="body",
-        start_angle=-np.pi,
-        end_angle=np.pi - 2.0 * np.pi / max(1, count),
-        ranges=list(ranges),
-    )
 
 
 def wait_until(is_true: Callable[[], bool], *, timeout_s: float = DEADLINE_S) -> None:

@@ -21,7 +21,8 @@ from hmt_service.service.keys import Input
 from hmt_service.service.readings import encode_reading
 from hmt_service.service.session import Endpoints, Mode, open_session
 from tests.flat import SETTINGS, readings
-from tests.service.harness import RunningDaemon, laser_scan, running_daemon, wait_until
+from tests.messages import laser_scan
+from tests.service.harness import RunningDaemon, running_daemon, wait_until
 
 SCANS = 200
 NAN, INF = float("nan"), float("inf")

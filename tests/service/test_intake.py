@@ -13,7 +13,8 @@ from hmt_service.service.intake import Intake, IntakeLimits
 from hmt_service.service.keys import Input
 from hmt_service.service.readings import encode_reading
 from tests.flat import readings
-from tests.service.harness import laser_scan, wait_until
+from tests.messages import laser_scan
+from tests.service.harness import wait_until
 
 LIMITS = IntakeLimits(sample_bytes=20_000, queue_bytes=250_000, silence_s=0.05)
 

@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hmt_service.core.geometry import identity
+from hmt_service.core.ordering import ReorderWindow
 from hmt_service.core.types import OdometryReading, Reading, Scan
-from hmt_service.runtime.ordering import ReorderWindow
 
 
 def scan(stamp_s: float) -> Scan:

@@ -1,0 +1,362 @@
+"""What robots send and record: foxglove messages to readings, with what is wrong, and back.
+
+A scan is a `foxglove.LaserScan` or a `foxglove.PointCloud` whose `frame_id` is the body and whose
+`pose` is the pose of the sensor on the body; a cloud may carry a field `sweep_share`, the capture
+time of each point as a share of the sweep. Odometry is a `foxglove.Odometry` or a
+`foxglove.PoseInFrame` in the frame "odom".
+
+References:
+    foxglove schemas; ROS REP 117 (what infinite and undefined ranges mean), REP 105 (names of
+    frames).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from foxglove_schemas_protobuf.LaserScan_pb2 import LaserScan
+from foxglove_schemas_protobuf.Odometry_pb2 import Odometry
+from foxglove_schemas_protobuf.PackedElementField_pb2 import PackedElementField
+from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
+from foxglove_schemas_protobuf.Pose_pb2 import Pose as PoseMessage
+from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
+from foxglove_schemas_protobuf.Quaternion_pb2 import Quaternion
+from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
+from google.protobuf.message import DecodeError, Message
+from google.protobuf.timestamp_pb2 import Timestamp
+
+from hmt_service.core.geometry import (
+    FloatArray,
+    Pose,
+    identity,
+    pose_of,
+    quaternion_of,
+    transform_points,
+)
+from hmt_service.core.types import OdometryReading, Reading, Scan
+from hmt_service.errors import InvalidInput
+
+BODY_FRAMES = frozenset({"body", "base_link"})
+"""Names of the body frame: ours and ROS's."""
+ODOMETRY_FRAME = "odom"
+"""Name of the frame that odometry drifts in."""
+_SWEEP_SHARE = "sweep_share"
+_NANOSECONDS = 10**9
+_MAX_WRONG_SHARE = 0.5
+# A range written with centimetres and rebuilt from coordinates must not fall off the end of the
+# sensor.
+_RANGE_TOLERANCE_M = 1e-6
+# Farther than any sensor from its robot, and any robot from its start: beyond it numbers lose their
+# meaning.
+_MAX_SENSOR_OFFSET_M = 1e3
+_MAX_ODOMETRY_M = 1e7
+_FULL_TURN_RAD = 2.0 * np.pi + 1e-6
+_TYPES: dict[int, str] = {
+    PackedElementField.UINT8: "u1",
+    PackedElementField.INT8: "i1",
+    PackedElementField.UINT16: "<u2",
+    PackedElementField.INT16: "<i2",
+    PackedElementField.UINT32: "<u4",
+    PackedElementField.INT32: "<i4",
+    PackedElementField.FLOAT32: "<f4",
+    PackedElementField.FLOAT64: "<f8",
+}
+_FLOATS = {4: PackedElementField.FLOAT32, 8: PackedElementField.FLOAT64}
+
+
+class Defect(StrEnum):
+    """Why a message is no reading, or a reading does not fit those before it."""
+
+    NOT_PROTOBUF = "not_protobuf"
+    WRONG_FRAME = "wrong_frame"
+    BAD_STAMP = "bad_stamp"
+    BAD_POSE = "bad_pose"
+    BAD_GEOMETRY = "bad_geometry"
+    EMPTY = "empty"
+    NAN_RANGES = "nan_ranges"
+    NEGATIVE_RANGES = "negative_ranges"
+    TIME_BACKWARDS = "time_backwards"
+    TIME_JUMPED = "time_jumped"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Decoded:
+    """A reading that passed every check that needs no other reading."""
+
+    reading: Reading
+    """What the robot said."""
+    body_frame: str | None = None
+    """What the message calls the body; None where it does not say."""
+    dropped_beams: Mapping[Defect, int] = field(default_factory=lambda: MappingProxyType({}))
+    """Beams that are left out of it because they are wrong; those without a return are not."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Rules:
+    """What the messages of one sender are held to."""
+
+    min_range_m: float
+    max_range_m: float
+    body_frames: Collection[str] | None
+
+    def check_body(self, frame: str) -> None:
+        if self.body_frames is not None and frame not in self.body_frames:
+            raise _DefectError(Defect.WRONG_FRAME)
+
+    def is_return(self, ranges: FloatArray) -> npt.NDArray[np.bool_]:
+        nearest = self.min_range_m - _RANGE_TOLERANCE_M
+        farthest = self.max_range_m + _RANGE_TOLERANCE_M
+        return (ranges >= nearest) & (ranges <= farthest)
+
+
+class _DefectError(Exception):
+    """Carries a defect out of the checks below; never leaves this module."""
+
+    def __init__(self, defect: Defect) -> None:
+        super().__init__(defect)
+        self.defect = defect
+
+
+def decode(
+    schema: str,
+    payload: bytes,
+    *,
+    min_range_m: float,
+    max_range_m: float,
+    body_frames: Collection[str] | None = BODY_FRAMES,
+) -> Decoded | Defect:
+    """Return the reading in a message, or why there is none.
+
+    Args:
+        schema: Full name of the message, one of `SCAN_SCHEMAS` or `ODOMETRY_SCHEMAS`.
+        payload: The message, serialised.
+        min_range_m: Nearer points count as no return.
+        max_range_m: Farther points count as no return.
+        body_frames: Names that the body may have; None for any.
+    """
+    message_type, read = _READERS[schema]
+    try:
+        return read(message_type.FromString(payload), _Rules(min_range_m, max_range_m, body_frames))
+    except DecodeError:
+        return Defect.NOT_PROTOBUF
+    except _DefectError as error:
+        return error.defect
+
+
+def encode(
+    reading: Reading, numbers: type[np.float64 | np.float32] = np.float64
+) -> PointCloud | Odometry:
+    """Return a reading as a message: a scan as `PointCloud`, odometry as `Odometry`.
+
+    Stamps are rounded to ns. With float64, points come back bit for bit where the sensor is at the
+    centre of the body, within rounding elsewhere.
+
+    Args:
+        reading: What to encode.
+        numbers: Type of the coordinates, which count from the sensor, and of the times.
+
+    Raises:
+        InvalidInput: If the stamp is not finite.
+    """
+    if isinstance(reading, OdometryReading):
+        return Odometry(
+            timestamp=_timestamp(reading.stamp_s),
+            frame_id=ODOMETRY_FRAME,
+            body_frame_id="body",
+            pose=_pose_to_proto(reading.odom_from_body),
+        )
+    body_from_sensor = identity()
+    body_from_sensor[:3, 3] = reading.sensor_in_body
+    names = ["x", "y", "z"] if reading.point_times is None else ["x", "y", "z", _SWEEP_SHARE]
+    points = len(reading.points_in_body)
+    # A cloud of nothing is a broken sensor's; a scan without a return is a direction without one.
+    data = np.full((max(1, points), len(names)), np.inf, np.dtype(numbers).newbyteorder("<"))
+    data[:points, :3] = reading.points_in_body - reading.sensor_in_body
+    if reading.point_times is not None:
+        data[:points, 3] = reading.point_times
+    return PointCloud(
+        timestamp=_timestamp(reading.stamp_s),
+        frame_id="body",
+        pose=_pose_to_proto(body_from_sensor),
+        point_stride=data.itemsize * len(names),
+        fields=[
+            PackedElementField(
+                name=name, offset=data.itemsize * column, type=_FLOATS[data.itemsize]
+            )
+            for column, name in enumerate(names)
+        ],
+        data=data.tobytes(),
+    )
+
+
+def _laser_scan(message: LaserScan, rules: _Rules) -> Decoded:
+    stamp_s = _stamp(message)
+    body_from_sensor = _body_from_sensor(message, rules)
+    ranges = np.array(message.ranges)
+    dropped = _wrong_beams(ranges)
+    span = message.end_angle - message.start_angle
+    # NaN fails every comparison, and with it the check.
+    if not (abs(span) <= _FULL_TURN_RAD and abs(message.start_angle) <= 2.0 * _FULL_TURN_RAD):
+        raise _DefectError(Defect.BAD_GEOMETRY)
+    angles = message.start_angle + span * np.arange(len(ranges)) / max(1, len(ranges) - 1)
+    has_return = rules.is_return(ranges)
+    directions = np.stack([np.cos(angles), np.sin(angles), np.zeros(len(angles))], axis=1)
+    points = ranges[has_return, None] * directions[has_return]
+    points_in_body = transform_points(body_from_sensor, points)
+    scan = Scan(stamp_s, points_in_body, body_from_sensor[:3, 3])
+    return Decoded(scan, message.frame_id, dropped)
+
+
+def _point_cloud(message: PointCloud, rules: _Rules) -> Decoded:
+    stamp_s = _stamp(message)
+    body_from_sensor = _body_from_sensor(message, rules)
+    rows = _rows(message)
+    points = np.zeros((len(rows), 3))
+    for axis, name in enumerate("xyz"):
+        if name in _names(rows):
+            points[:, axis] = rows[name]
+    with np.errstate(over="ignore"):
+        ranges = np.linalg.norm(points, axis=1)
+    # Organised clouds mark directions without a return by NaN: only a cloud of nothing else is
+    # wrong.
+    undefined = int(np.count_nonzero(np.isnan(ranges)))
+    if undefined == len(rows):
+        raise _DefectError(Defect.NAN_RANGES)
+    has_return = rules.is_return(ranges)
+    point_times = None
+    if _SWEEP_SHARE in _names(rows):
+        point_times = rows[_SWEEP_SHARE][has_return].astype(np.float64)
+        if not np.all((point_times >= 0.0) & (point_times <= 1.0)):
+            raise _DefectError(Defect.BAD_GEOMETRY)
+    points_in_body = transform_points(body_from_sensor, points[has_return])
+    scan = Scan(stamp_s, points_in_body, body_from_sensor[:3, 3], point_times)
+    return Decoded(scan, message.frame_id, {Defect.NAN_RANGES: undefined} if undefined else {})
+
+
+def _odometry(message: Odometry, rules: _Rules) -> Decoded:
+    rules.check_body(message.body_frame_id)
+    return Decoded(_odometry_reading(message), message.body_frame_id)
+
+
+def _pose_in_frame(message: PoseInFrame, _: _Rules) -> Decoded:
+    return Decoded(_odometry_reading(message))
+
+
+def _odometry_reading(message: Odometry | PoseInFrame) -> OdometryReading:
+    stamp_s = _stamp(message)
+    if message.frame_id != ODOMETRY_FRAME:
+        raise _DefectError(Defect.WRONG_FRAME)
+    if not message.HasField("pose"):
+        raise _DefectError(Defect.BAD_POSE)
+    return OdometryReading(stamp_s, _pose(message.pose, farthest_m=_MAX_ODOMETRY_M))
+
+
+_Reader = tuple[type[Message], Callable[[Any, _Rules], Decoded]]
+_SCANS: dict[str, _Reader] = {
+    LaserScan.DESCRIPTOR.full_name: (LaserScan, _laser_scan),
+    PointCloud.DESCRIPTOR.full_name: (PointCloud, _point_cloud),
+}
+_ODOMETRY: dict[str, _Reader] = {
+    Odometry.DESCRIPTOR.full_name: (Odometry, _odometry),
+    PoseInFrame.DESCRIPTOR.full_name: (PoseInFrame, _pose_in_frame),
+}
+_READERS = _SCANS | _ODOMETRY
+SCAN_SCHEMAS = frozenset(_SCANS)
+"""Full names of the messages that hold a scan."""
+ODOMETRY_SCHEMAS = frozenset(_ODOMETRY)
+"""Full names of the messages that hold odometry."""
+
+
+def _wrong_beams(ranges: FloatArray) -> dict[Defect, int]:
+    """Return how many beams are wrong, by reason; +inf says "no return" (REP 117) and is right."""
+    if len(ranges) == 0:
+        raise _DefectError(Defect.EMPTY)
+    counts = {
+        Defect.NAN_RANGES: int(np.count_nonzero(np.isnan(ranges))),
+        Defect.NEGATIVE_RANGES: int(np.count_nonzero(ranges < 0.0)),
+    }
+    if sum(counts.values()) > _MAX_WRONG_SHARE * len(ranges):
+        raise _DefectError(max(counts, key=lambda reason: counts[reason]))
+    return {reason: count for reason, count in counts.items() if count}
+
+
+def _rows(message: PointCloud) -> npt.NDArray[np.void]:
+    """Return a cloud as a structured array, one row per point."""
+    stride, fields = message.point_stride, {f.name: f for f in message.fields}
+    is_consistent = (
+        len(fields) == len(message.fields)
+        and len(fields.keys() & {"x", "y", "z"}) >= 2
+        and all(
+            f.type in _TYPES and f.offset + np.dtype(_TYPES[f.type]).itemsize <= stride
+            for f in message.fields
+        )
+        and len(message.data) % stride == 0
+    )
+    if not is_consistent:
+        raise _DefectError(Defect.BAD_GEOMETRY)
+    if not message.data:
+        raise _DefectError(Defect.EMPTY)
+    dtype = np.dtype(
+        {
+            "names": list(fields),
+            "formats": [_TYPES[f.type] for f in fields.values()],
+            "offsets": [f.offset for f in fields.values()],
+            "itemsize": stride,
+        }
+    )
+    return np.frombuffer(message.data, dtype=dtype)
+
+
+def _names(rows: npt.NDArray[np.void]) -> tuple[str, ...]:
+    return rows.dtype.names or ()
+
+
+def _body_from_sensor(message: LaserScan | PointCloud, rules: _Rules) -> Pose:
+    rules.check_body(message.frame_id)
+    if not message.HasField("pose"):
+        return identity()
+    return _pose(message.pose, farthest_m=_MAX_SENSOR_OFFSET_M)
+
+
+def _pose(message: PoseMessage, *, farthest_m: float) -> Pose:
+    p, q = message.position, message.orientation
+    quaternion = [q.x, q.y, q.z, q.w] if message.HasField("orientation") else [0.0, 0.0, 0.0, 1.0]
+    try:
+        with np.errstate(over="ignore"):
+            pose = pose_of(np.array(quaternion), np.array([p.x, p.y, p.z]))
+    except InvalidInput as error:
+        raise _DefectError(Defect.BAD_POSE) from error
+    if np.abs(pose[:3, 3]).max() > farthest_m:
+        raise _DefectError(Defect.BAD_POSE)
+    return pose
+
+
+def _pose_to_proto(pose: Pose) -> PoseMessage:
+    qx, qy, qz, qw = quaternion_of(pose).tolist()
+    x, y, z = pose[:3, 3].tolist()
+    return PoseMessage(
+        position=Vector3(x=x, y=y, z=z), orientation=Quaternion(x=qx, y=qy, z=qz, w=qw)
+    )
+
+
+def _stamp(message: LaserScan | PointCloud | Odometry | PoseInFrame) -> float:
+    stamp = message.timestamp
+    if not message.HasField("timestamp") or not 0 <= stamp.nanos < _NANOSECONDS:
+        raise _DefectError(Defect.BAD_STAMP)
+    return (stamp.seconds * _NANOSECONDS + stamp.nanos) / _NANOSECONDS
+
+
+def _timestamp(stamp_s: float) -> Timestamp:
+    if not math.isfinite(stamp_s):
+        raise InvalidInput(f"stamp {stamp_s} s is not finite")
+    whole = math.floor(stamp_s)
+    # Exact: the difference of two floats so near has no rounding.
+    seconds, nanos = divmod(round((stamp_s - whole) * _NANOSECONDS), _NANOSECONDS)
+    return Timestamp(seconds=whole + seconds, nanos=nanos)
