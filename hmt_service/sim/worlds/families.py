@@ -12,6 +12,8 @@ from enum import StrEnum
 from types import MappingProxyType
 
 from hmt_service.errors import InvalidInput
+from hmt_service.sim.worlds.aliased import aliased
+from hmt_service.sim.worlds.nested_loops import nested_loops
 from hmt_service.sim.worlds.office import office
 from hmt_service.sim.worlds.world import World
 
@@ -94,6 +96,18 @@ RECIPES: Mapping[Family, Recipe] = MappingProxyType(
             "One floor of an office: a ring of corridors, one across it, rooms on both sides.",
             office,
             (150.0, 230.0),
+            (_LAPS,),
+        ),
+        Family.ALIASED: Recipe(
+            "A ring of corridors or twin wings, drawn by the seed, with rooms that look the same.",
+            aliased,
+            (150.0, 300.0),
+            (Parameter("severity", 0, 1, 0.9, "Share of rooms that are exact copies of one."),),
+        ),
+        Family.NESTED_LOOPS: Recipe(
+            "Long corridors: two small loops inside a large one, which is closed late.",
+            nested_loops,
+            (550.0, 800.0),
             (_LAPS,),
         ),
     }
