@@ -164,7 +164,7 @@ def _twin_wings(pitch: float, rng: np.random.Generator) -> _Building:
     The route enters a room on either side of the link in the first wing, the same in the second,
     then comes back: once more into the first room, and into a new one.
     """
-    count, half = int(rng.integers(3, 6)), _CORRIDOR_M / 2
+    count, half = int(rng.integers(3, 5)), _CORRIDOR_M / 2
     nearest = half + 2 * _WALL_M
     other_y = _CORRIDOR_M + 2 * _DEPTH_M + _on_raster(rng.uniform(0.5, 6.0))
     xs = [nearest + (k + 0.5) * pitch for k in range(count)]
