@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
 
@@ -97,11 +98,12 @@ def _readings(run: Run, config: Config) -> tuple[str, tuple[Reading, ...], tuple
         run.say(f"{_LOG}: reading")
         return _LOG, first_scans(read_recorded(path, config), scans), ()
     # Ray casting loads slowly, and only this branch needs it.
-    from hmt_service.sim.simulation import simulate
+    from hmt_service.sim.simulation import INDOOR_LASER, simulate
     from hmt_service.sim.worlds.office import office
 
     run.say("simulating an office")
-    readings = first_scans(simulate(office(0), 0).readings, scans)
+    instants = islice(simulate(office(0), INDOOR_LASER, 0), scans)
+    readings = tuple(reading for instant in instants for reading in instant.readings)
     return "office", readings, (f"{_LOG}, simulated office instead: {path.reason}",)
 
 

@@ -44,23 +44,22 @@ def demo(
 
     from hmt_service.service.client import HmtClient
     from hmt_service.service.results import TRAJECTORY
-    from hmt_service.sim.simulation import simulate
+    from hmt_service.sim.simulation import INDOOR_LASER, simulate
     from hmt_service.sim.worlds.office import office
 
     console = Console()
     with console.status("simulating an office building"):
-        simulation = simulate(office(seed), seed)
-    console.print(
-        f"simulated {len(simulation.truth)} scans and the wheel odometry of a robot in an office"
-    )
+        instants = tuple(simulate(office(seed), INDOOR_LASER, seed))
+    console.print(f"simulated {len(instants)} scans and the wheel odometry of a robot in an office")
     endpoint = _free_endpoint()
     with _daemon(endpoint, out):
         with HmtClient(endpoint) as client:
-            replay_readings(client, simulation.readings, console)
+            readings = tuple(reading for instant in instants for reading in instant.readings)
+            replay_readings(client, readings, console)
         query.posterior(connect=endpoint)
         query.compare(connect=endpoint)
         query.map_(connect=endpoint, out=out / PICTURE)
-    _report_truth(console, out / TRAJECTORY, simulation.truth)
+    _report_truth(console, out / TRAJECTORY, [instant.truth for instant in instants])
     console.print(f"picture of both maps: {out / PICTURE}", soft_wrap=True)
 
 

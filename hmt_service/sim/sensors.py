@@ -1,4 +1,4 @@
-"""Simulated sensors: each turns the true trajectory into the readings that a robot would send.
+"""Simulated sensors: each turns the true motion into the readings that a robot would send.
 
 References:
     Thrun et al., Probabilistic Robotics, 2005, sections 5.4 (odometry) and 6.3 (beams).
@@ -7,98 +7,261 @@ References:
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
+from pydantic import Field
 
-from hmt_service.core.geometry import identity, inverse, planar_pose, transform_points, yaw_of
+from hmt_service.core.geometry import FloatArray, Pose, identity, inverse, planar_pose, yaw_of
 from hmt_service.core.types import OdometryReading, Scan, StampedPose
-from hmt_service.sim.raycasting import RayCaster
+from hmt_service.errors import InvalidInput
+from hmt_service.sim.declared import Declared, checked
+from hmt_service.sim.people import Crowd
+from hmt_service.sim.raycasting import Fans, RayCaster
+from hmt_service.sim.trajectories import Motion
+
+# Noise beyond does not happen in a run.
+_MOST_SIGMAS = 8.0
 
 
-@dataclass(frozen=True, slots=True)
-class Laser2d:
-    """A planar laser that looks forward."""
+@dataclass(frozen=True, slots=True, eq=False)
+class _Pattern:
+    """The rays of one sweep: a fan per column, a ray per row."""
 
-    beams: int = 361
-    """Number of beams."""
-    field_of_view_rad: float = math.radians(270.0)
-    """Angle between the first and the last beam."""
-    min_range_m: float = 0.1
-    """Nearer surfaces give no return."""
-    max_range_m: float = 20.0
-    """Farther surfaces give no return."""
-    range_sigma_m: float = 0.02
-    """Standard deviation of one range."""
-    sensor_in_body: tuple[float, float, float] = (0.1, 0.0, 0.3)
-    """Where the laser sits on the robot, m; its plane is horizontal."""
+    azimuths: FloatArray
+    """Of the columns in the sensor frame, shape (C,), rad."""
+    elevations: FloatArray
+    """Of the rows, shape (R,), rad."""
+    shares: FloatArray | None = None
+    """When each column is taken, as a share of the sweep, shape (C,); None: all at its end."""
+
+    @property
+    def directions(self) -> FloatArray:
+        """Unit vectors in the sensor frame, column by column, shape (C R, 3)."""
+        azimuth, elevation = np.meshgrid(self.azimuths, self.elevations, indexing="ij")
+        level = np.cos(elevation)
+        parts = [level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)]
+        return np.stack(parts, axis=-1).reshape(-1, 3)
+
+    def fans(self, world_from_body: FloatArray, sensor_in_body: FloatArray) -> Fans:
+        """Return a fan per column of each sweep.
+
+        Args:
+            world_from_body: Pose of each sweep, shape (B, 1, 4, 4), or column, (B, C, 4, 4).
+            sensor_in_body: Where the rays start, shape (3,), m.
+        """
+        rotation = world_from_body[..., :3, :3]
+        ahead, aside, up = np.moveaxis(rotation, -1, 0)
+        c, s = np.cos(self.azimuths)[:, None], np.sin(self.azimuths)[:, None]
+        forward = ahead * c + aside * s
+        origins = rotation @ sensor_in_body + world_from_body[..., :3, 3]
+        origins, up = (np.broadcast_to(each, forward.shape) for each in (origins, up))
+        return Fans(
+            origins.reshape(-1, 3), forward.reshape(-1, 3), up.reshape(-1, 3), self.elevations
+        )
+
+
+class RangeSensor(Declared, ABC):
+    """What a laser and a LiDAR have in common."""
+
+    __slots__ = ()
+
+    min_range_m: float
+    max_range_m: float
+    range_sigma_m: float
+    sensor_in_body: tuple[float, float, float]
+
+    def __post_init__(self) -> None:
+        """Refuse an empty interval of ranges."""
+        if self.min_range_m >= self.max_range_m:
+            raise InvalidInput(f"ranges from {self.min_range_m:g} m to {self.max_range_m:g} m")
+
+    @property
+    @abstractmethod
+    def rays(self) -> int:
+        """Number of rays of a scan."""
+
+    @property
+    def reach_m(self) -> float:
+        """Distance beyond which a surface gives no return, whatever the noise."""
+        return self.max_range_m + _MOST_SIGMAS * self.range_sigma_m
+
+    @abstractmethod
+    def _pattern(self) -> _Pattern:
+        """Return the rays of one sweep."""
 
     def observe(
-        self, caster: RayCaster, trajectory: Sequence[StampedPose], rng: np.random.Generator
+        self,
+        caster: RayCaster,
+        crowd: Crowd,
+        motion: Motion,
+        stamps_s: FloatArray,
+        period_s: float,
+        rng: np.random.Generator,
     ) -> Iterator[Scan]:
-        """Yield one scan per pose; beams without return are left out.
+        """Yield one scan per stamp; rays without return are left out.
 
         Args:
             caster: World that the robot moves in.
-            trajectory: True poses in the frame of the world.
+            crowd: People in it.
+            motion: True motion in the frame of the world.
+            stamps_s: Times of the scans, shape (B,): the ends of the sweeps.
+            period_s: Time between two scans, all of which a sweep takes.
             rng: Source of the range noise.
         """
-        half = self.field_of_view_rad / 2
-        angles = np.linspace(-half, half, self.beams)
-        directions = np.column_stack([np.cos(angles), np.sin(angles), np.zeros_like(angles)])
+        pattern = self._pattern()
+        times = stamps_s[:, None]
+        if pattern.shares is not None:
+            times = times + (pattern.shares - 1.0) * period_s
         mount = np.array(self.sensor_in_body)
-        for pose in trajectory:
-            world_from_body = pose.reference_from_body
-            origin = transform_points(world_from_body, mount[None])[0]
-            ranges = caster.ranges(origin, directions @ world_from_body[:3, :3].T)
-            ranges += rng.normal(0.0, self.range_sigma_m, self.beams)
-            is_return = (ranges >= self.min_range_m) & (ranges <= self.max_range_m)
-            points = mount + directions[is_return] * ranges[is_return, None]
-            yield Scan(pose.stamp_s, points, mount)
+        fans = pattern.fans(motion.at(times), mount)
+        per_fan = np.broadcast_to(times, (len(stamps_s), len(pattern.azimuths))).ravel()
+        ranges = np.minimum(caster.ranges(fans), crowd.ranges(fans, per_fan, self.reach_m))
+        noise = rng.normal(0.0, self.range_sigma_m, (len(stamps_s), self.rays))
+        yield from self._scans(stamps_s, ranges.reshape(noise.shape) + noise, pattern, mount)
+
+    def _scans(
+        self, stamps_s: FloatArray, ranges: FloatArray, pattern: _Pattern, mount: FloatArray
+    ) -> Iterator[Scan]:
+        directions, times = pattern.directions, None
+        if pattern.shares is not None:
+            times = pattern.shares.repeat(len(pattern.elevations))
+        for stamp_s, each in zip(stamps_s.tolist(), ranges, strict=True):
+            is_return = (each >= self.min_range_m) & (each <= self.max_range_m)
+            points = mount + directions[is_return] * each[is_return, None]
+            yield Scan(stamp_s, points, mount, None if times is None else times[is_return])
 
 
-@dataclass(frozen=True, slots=True)
-class WheelOdometry:
-    """Dead reckoning of a wheeled robot: wrong wheel radii, unequal wheels, slip."""
+@checked
+class Laser2d(RangeSensor):
+    """A planar laser that looks forward and takes a whole scan at once."""
 
-    scale: float = 1.01
+    beams: int = Field(default=361, ge=2)
+    """Number of beams."""
+    field_of_view_rad: float = Field(default=math.radians(270.0), gt=0.0, le=math.tau)
+    """Angle between the first and the last beam."""
+    min_range_m: float = Field(default=0.1, ge=0.0)
+    """Nearer surfaces give no return."""
+    max_range_m: float = Field(default=20.0, gt=0.0)
+    """Farther surfaces give no return."""
+    range_sigma_m: float = Field(default=0.02, ge=0.0)
+    """Standard deviation of one range."""
+    sensor_in_body: tuple[float, float, float] = (0.1, 0.0, 0.3)
+    """Where the laser sits on the robot, m; its plane is the robot's."""
+
+    @property
+    def rays(self) -> int:
+        """Number of rays of a scan."""
+        return self.beams
+
+    def _pattern(self) -> _Pattern:
+        half = self.field_of_view_rad / 2
+        return _Pattern(np.linspace(-half, half, self.beams), np.zeros(1))
+
+
+@checked
+class Lidar3d(RangeSensor):
+    """A spinning LiDAR that nobody compensates: every column is taken from where the robot is then.
+
+    A sweep takes the whole period between two scans, counter-clockwise from behind, and ends at the
+    stamp of the scan. Column c of C is taken at the share (c + 1) / C of the sweep, and its points
+    are expressed in the body frame of that moment. `core.registration.deskew` carries all of them
+    into the body frame at the end of the sweep: there is the true pose of the scan.
+    """
+
+    rows: int = Field(default=16, ge=1, le=256)
+    """Number of lasers above each other."""
+    columns: int = Field(default=720, ge=2)
+    """Firings of all rows per turn."""
+    vertical_fov_rad: float = Field(default=math.radians(30.0), gt=0.0, lt=math.pi)
+    """Angle between the lowest and the highest row, half of it above the horizon."""
+    min_range_m: float = Field(default=0.5, ge=0.0)
+    """Nearer surfaces give no return."""
+    max_range_m: float = Field(default=60.0, gt=0.0)
+    """Farther surfaces give no return."""
+    range_sigma_m: float = Field(default=0.02, ge=0.0)
+    """Standard deviation of one range."""
+    sensor_in_body: tuple[float, float, float] = (0.0, 0.0, 0.8)
+    """Where the LiDAR sits on the robot, m; its axis is the robot's."""
+
+    @property
+    def rays(self) -> int:
+        """Number of rays of a scan."""
+        return self.rows * self.columns
+
+    def _pattern(self) -> _Pattern:
+        half = 0.0 if self.rows == 1 else self.vertical_fov_rad / 2
+        return _Pattern(
+            np.linspace(-math.pi, math.pi, self.columns, endpoint=False),
+            np.linspace(-half, half, self.rows),
+            np.arange(1, self.columns + 1) / self.columns,
+        )
+
+
+@checked
+class WheelOdometry(Declared):
+    """Dead reckoning of a wheeled robot: wrong wheel radii, unequal wheels, noise, slip."""
+
+    scale: float = Field(default=1.01, gt=0.0)
     """Measured over true distance."""
     drift_rad_per_m: float = 0.001
     """Systematic error of the heading."""
-    sigma_m_per_sqrt_m: float = 0.02
+    sigma_m_per_sqrt_m: float = Field(default=0.02, ge=0.0)
     """Standard deviation of the position along and across the motion after 1 m."""
-    sigma_rad_per_sqrt_m: float = 0.006
+    sigma_rad_per_sqrt_m: float = Field(default=0.006, ge=0.0)
     """Standard deviation of the heading after 1 m."""
-    sigma_rad_per_sqrt_rad: float = 0.015
+    sigma_rad_per_sqrt_rad: float = Field(default=0.015, ge=0.0)
     """Standard deviation of the heading after a turn of 1 rad."""
+    slips_per_m: float = Field(default=0.0, ge=0.0)
+    """Mean number of times per metre that the wheels slip (a Poisson process)."""
+    slip_m: float = Field(default=0.0, ge=0.0)
+    """Mean distance that the wheels turn too far in one slip (exponentially distributed)."""
+    slip_sigma_rad: float = Field(default=0.0, ge=0.0)
+    """Standard deviation of the heading error of one slip."""
 
     def observe(
-        self, trajectory: Sequence[StampedPose], rng: np.random.Generator
+        self, trajectory: Iterable[StampedPose], rng: np.random.Generator
     ) -> Iterator[OdometryReading]:
         """Yield one reading per pose, in a frame that starts at the first one.
 
+        The wheels know nothing of slopes: the readings are planar, and distances are along the
+        ground.
+
         Args:
-            trajectory: True planar poses.
+            trajectory: True poses.
             rng: Source of the noise.
         """
-        if not trajectory:
+        (slip_rng,) = rng.spawn(1)
+        poses = iter(trajectory)
+        before = next(poses, None)
+        if before is None:
             return
         odom_from_body = identity()
-        yield OdometryReading(trajectory[0].stamp_s, odom_from_body)
-        for before, after in pairwise(trajectory):
+        yield OdometryReading(before.stamp_s, odom_from_body)
+        for after in poses:
             motion = inverse(before.reference_from_body) @ after.reference_from_body
-            distance, turn = float(np.hypot(*motion[:2, 3])), yaw_of(motion)
-            x, y = rng.normal(
-                self.scale * motion[:2, 3], self.sigma_m_per_sqrt_m * math.sqrt(distance)
-            )
-            yaw = rng.normal(
-                turn + self.drift_rad_per_m * distance,
-                math.hypot(
-                    self.sigma_rad_per_sqrt_m * math.sqrt(distance),
-                    self.sigma_rad_per_sqrt_rad * math.sqrt(abs(turn)),
-                ),
-            )
-            odom_from_body = odom_from_body @ planar_pose(x, y, yaw)
+            odom_from_body = odom_from_body @ self._measured(motion, rng, slip_rng)
             yield OdometryReading(after.stamp_s, odom_from_body)
+            before = after
+
+    def _measured(
+        self, motion: Pose, rng: np.random.Generator, slip_rng: np.random.Generator
+    ) -> Pose:
+        """Return what the wheels make of a motion, planar, shape (4, 4)."""
+        distance, turn = float(np.hypot(*motion[:2, 3])), yaw_of(motion)
+        x, y = rng.normal(self.scale * motion[:2, 3], self.sigma_m_per_sqrt_m * math.sqrt(distance))
+        yaw = rng.normal(
+            turn + self.drift_rad_per_m * distance,
+            math.hypot(
+                self.sigma_rad_per_sqrt_m * math.sqrt(distance),
+                self.sigma_rad_per_sqrt_rad * math.sqrt(abs(turn)),
+            ),
+        )
+        slips = slip_rng.poisson(self.slips_per_m * distance)
+        if slips:
+            # The sum of exponential draws is a gamma one.
+            x += self.slip_m * slip_rng.gamma(slips)
+            yaw += self.slip_sigma_rad * math.sqrt(slips) * slip_rng.standard_normal()
+        return planar_pose(x, y, yaw)

@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 
 from hmt_service.core.geometry import inverse, planar_pose, transform_points, yaw_of
-from hmt_service.core.types import StampedPose
+from hmt_service.core.types import Scan, StampedPose
+from hmt_service.sim.people import Crowd
 from hmt_service.sim.raycasting import RayCaster
-from hmt_service.sim.sensors import Laser2d, WheelOdometry
+from hmt_service.sim.sensors import Laser2d, RangeSensor, WheelOdometry
+from hmt_service.sim.trajectories import Motion
 from hmt_service.sim.worlds.world import World
 
 # One wall of 200 m x 2 m at y = 5 m.
@@ -36,10 +38,20 @@ def straight(length_m: float, steps: int) -> tuple[StampedPose, ...]:
     return stamped([planar_pose(x, 0.0, 0.0) for x in np.linspace(0.0, length_m, steps + 1)])
 
 
+def seen_by(
+    sensor: RangeSensor, world_from_body: np.ndarray, *, scans: int = 1, seed: int = 0
+) -> tuple[Scan, ...]:
+    """Return what a robot sees that stands still in front of the wall, alone."""
+    rng = np.random.default_rng(seed)
+    nobody = Crowd(WALL.route_m, 0, rng)
+    motion = Motion(0.0, world_from_body[None])
+    return tuple(sensor.observe(RayCaster(WALL), nobody, motion, np.arange(float(scans)), 1.0, rng))
+
+
 def test_exact_laser_sees_the_wall_where_it_is() -> None:
     laser = Laser2d(range_sigma_m=0.0)
     world_from_body = planar_pose(3.0, 1.0, math.pi / 2)
-    (scan,) = laser.observe(RayCaster(WALL), stamped([world_from_body]), np.random.default_rng(0))
+    (scan,) = seen_by(laser, world_from_body)
     points = transform_points(world_from_body, scan.points_in_body)
     assert points[:, 1] == pytest.approx(5.0, abs=1e-4)
     assert points[:, 2] == pytest.approx(laser.sensor_in_body[2])
@@ -51,7 +63,7 @@ def test_exact_laser_sees_the_wall_where_it_is() -> None:
 def test_beams_beyond_the_maximal_range_are_left_out() -> None:
     laser = Laser2d(range_sigma_m=0.0, max_range_m=8.0)
     facing = planar_pose(0.0, 1.0, math.pi / 2)
-    (scan,) = laser.observe(RayCaster(WALL), stamped([facing]), np.random.default_rng(0))
+    (scan,) = seen_by(laser, facing)
     ranges = np.linalg.norm(scan.points_in_body - scan.sensor_in_body, axis=1)
     assert ranges.max() <= 8.0
     # The wall is 3.9 m away: returns come from within acos(3.9 / 8) of straight ahead.
@@ -61,15 +73,15 @@ def test_beams_beyond_the_maximal_range_are_left_out() -> None:
 
 def test_laser_that_sees_nothing_sends_an_empty_scan() -> None:
     away = planar_pose(0.0, -40.0, -math.pi / 2)
-    (scan,) = Laser2d().observe(RayCaster(WALL), stamped([away]), np.random.default_rng(0))
+    (scan,) = seen_by(Laser2d(), away)
     assert scan.points_in_body.shape == (0, 3)
 
 
 def test_range_noise_has_the_stated_sigma() -> None:
-    laser = Laser2d(beams=1, field_of_view_rad=0.0, range_sigma_m=0.05)
-    poses = stamped([planar_pose(0.0, 0.0, math.pi / 2)] * 4000)
-    scans = laser.observe(RayCaster(WALL), poses, np.random.default_rng(1))
-    ranges = np.array([scan.points_in_body[0, 0] - scan.sensor_in_body[0] for scan in scans])
+    laser = Laser2d(beams=3, field_of_view_rad=0.2, range_sigma_m=0.05)
+    scans = seen_by(laser, planar_pose(0.0, 0.0, math.pi / 2), scans=4000, seed=1)
+    ahead = [scan.points_in_body[1, 0] for scan in scans]
+    ranges = np.array(ahead) - laser.sensor_in_body[0]
     # Five standard errors of a mean and of a standard deviation of 4000 draws.
     assert ranges.mean() == pytest.approx(4.9, abs=5 * 0.05 / math.sqrt(4000))
     assert ranges.std() == pytest.approx(0.05, rel=5 / math.sqrt(2 * 4000))
