@@ -74,9 +74,8 @@ class ReorderWindow:
     def finish(self) -> tuple[Reading, ...]:
         """Return everything that is held, in order."""
         jumped, self._jumped = self._jumped, None
-        if jumped is not None:
-            self._add(jumped)
-        return self.flush()
+        released = self._add(jumped) if jumped is not None else ()
+        return (*released, *self.flush())
 
     def _add(self, reading: Reading) -> tuple[Reading, ...]:
         is_scan = not isinstance(reading, OdometryReading)
