@@ -13,8 +13,10 @@ from types import MappingProxyType
 
 from hmt_service.errors import InvalidInput
 from hmt_service.sim.worlds.aliased import aliased
+from hmt_service.sim.worlds.garage import garage
 from hmt_service.sim.worlds.nested_loops import nested_loops
 from hmt_service.sim.worlds.office import office
+from hmt_service.sim.worlds.warehouse import warehouse
 from hmt_service.sim.worlds.world import World
 
 
@@ -109,6 +111,17 @@ RECIPES: Mapping[Family, Recipe] = MappingProxyType(
             nested_loops,
             (550.0, 800.0),
             (_LAPS,),
+        ),
+        Family.WAREHOUSE: Recipe(
+            "Rows of equal racks with loads that vary a little, cross aisles, docks.",
+            warehouse,
+            (300.0, 500.0),
+        ),
+        Family.GARAGE: Recipe(
+            "Parking floors that look alike one above the other, joined by ramps; for LiDARs.",
+            garage,
+            (550.0, 650.0),
+            (Parameter("floors", 2, 6, 3, "Number of floors.", is_whole=True),),
         ),
     }
 )

@@ -70,12 +70,12 @@ class Box:
             self.base,
         )
 
-    def moved(self, x: float, y: float, quarter_turns: int = 0) -> Box:
+    def moved(self, x: float, y: float, quarter_turns: int = 0, z: float = 0.0) -> Box:
         """Return the box turned counter-clockwise about the origin, then shifted."""
         x_min, y_min, x_max, y_max = self.x_min, self.y_min, self.x_max, self.y_max
         for _ in range(quarter_turns % 4):
             x_min, y_min, x_max, y_max = -y_max, x_min, -y_min, x_max
-        return Box(x + x_min, y + y_min, x + x_max, y + y_max, self.height, self.base)
+        return Box(x + x_min, y + y_min, x + x_max, y + y_max, self.height, z + self.base)
 
 
 def wall_along_x(x_min: float, x_max: float, y: float) -> Box:
@@ -153,6 +153,13 @@ def furniture(
                 standing.append(piece)
                 break
     return standing
+
+
+def parked_car(length: float, width: float) -> list[Box]:
+    """Return a car that stands at the origin and looks along x."""
+    body = Box(-length / 2, -width / 2, length / 2, width / 2, 0.85)
+    cabin = Box(-0.35 * length, -0.42 * width, 0.2 * length, 0.42 * width, 0.6, 0.85)
+    return [body, cabin]
 
 
 # A unit box: bit 0 of a corner's number is x, bit 1 is y, bit 2 is z.
