@@ -6,7 +6,7 @@ References: own.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,7 +15,7 @@ from hmt_service.core.types import Reading, Scan
 from hmt_service.io.logs import read_log
 
 
-def first_scans(readings: Sequence[Reading], scans: int | None) -> tuple[Reading, ...]:
+def first_scans(readings: Iterable[Reading], scans: int | None) -> tuple[Reading, ...]:
     """Return the readings up to and including scan number `scans`; all of them for None."""
     return tuple(readings) if scans is None else tuple(_until(readings, scans))
 
@@ -47,7 +47,7 @@ def recorded_file(name: str) -> Path | Missing:
     return path
 
 
-def read_recorded(path: Path, config: Config) -> tuple[Reading, ...]:
-    """Return the readings of a recorded log as `hmt run` sees them."""
+def read_recorded(path: Path, config: Config) -> Iterable[Reading]:
+    """Return the readings of a recorded log as `hmt run` sees them, again and again."""
     sensor = config.sensor
     return read_log(path, min_range_m=sensor.min_range_m, max_range_m=sensor.max_range_m).readings

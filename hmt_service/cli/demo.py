@@ -55,7 +55,7 @@ def demo(
     with _daemon(endpoint, out):
         with HmtClient(endpoint) as client:
             readings = tuple(reading for instant in instants for reading in instant.readings)
-            replay_readings(client, readings, console)
+            replay_readings(client, readings, console, total=len(readings))
         query.posterior(connect=endpoint)
         query.compare(connect=endpoint)
         query.map_(connect=endpoint, out=out / PICTURE)

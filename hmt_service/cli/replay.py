@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hmt_service.cli.connection import Connect, Robot, Site
+from hmt_service.cli.recorded import print_contents, print_malformed
 from hmt_service.errors import DaemonFailure
 from hmt_service.service.keys import DEFAULT_ENDPOINT
 
@@ -27,14 +28,14 @@ if TYPE_CHECKING:
 
 _FARTHEST_M = 1e6
 """Everything finite is sent: what is a return is the daemon's settings' business."""
-_CHECK_EVERY = 200
+_CHECK_EVERY_BYTES = 1_000_000
 _POLL_S = 0.1
 _MOST_QUEUED_BYTES = 64_000_000
 """The sender waits while more than this waits at the daemon, which drops what it cannot hold."""
 
 
 def replay(
-    log: Annotated[Path, typer.Argument(help="Recorded log.")],
+    log: Annotated[Path, typer.Argument(help="Recorded log: CARMEN or MCAP.")],
     connect: Connect = DEFAULT_ENDPOINT,
     site: Site = "site",
     robot: Robot = "robot",
@@ -56,15 +57,25 @@ def replay(
     with HmtClient(connect, site=site, robot=robot) as client:
         client.status()
         with console.status(f"reading {log}"):
-            readings = read_log(log, min_range_m=0.0, max_range_m=_FARTHEST_M).readings
-        replay_readings(client, readings, console, rate=rate, has_finish=finish)
+            recorded = read_log(log, min_range_m=0.0, max_range_m=_FARTHEST_M)
+        print_contents(console, recorded)
+        replay_readings(
+            client,
+            recorded.readings,
+            console,
+            total=recorded.scans + recorded.odometry,
+            rate=rate,
+            has_finish=finish,
+        )
+    print_malformed(console, recorded)
 
 
 def replay_readings(
     client: HmtClient,
-    readings: Sequence[Reading],
+    readings: Iterable[Reading],
     console: Console,
     *,
+    total: int,
     rate: float | None = None,
     has_finish: bool = True,
 ) -> None:
@@ -74,6 +85,7 @@ def replay_readings(
         client: Connection to the daemon.
         readings: In the order of time.
         console: Where the progress is shown.
+        total: How many readings there are, about: for the progress only.
         rate: Speed in multiples of real time; None for full speed.
         has_finish: Whether to wait for the complete map.
 
@@ -85,29 +97,34 @@ def replay_readings(
     from hmt_service.core.types import Scan
 
     before = client.status()
-    scans = sum(isinstance(reading, Scan) for reading in readings)
+    sent = scans = unchecked = 0
     with Progress(console=console) as progress:
-        sending = progress.add_task("sending", total=len(readings))
-        for sent, reading in enumerate(_paced(readings, rate)):
-            if sent % _CHECK_EVERY == 0:
+        sending = progress.add_task("sending", total=total)
+        for reading in _paced(readings, rate):
+            if unchecked > _CHECK_EVERY_BYTES:
                 _wait_for_room(client)
-            client.publish(reading)
-            progress.advance(sending)
+                unchecked = 0
+            unchecked += client.publish(reading)
+            sent += 1
+            scans += isinstance(reading, Scan)
+            progress.update(sending, completed=sent)
         if has_finish:
             mapping = progress.add_task("mapping", total=scans)
             known = before.processed_scans
             _finish(client, lambda n: progress.update(mapping, completed=n - known))
-    _report(console, len(readings), before, client.status())
+    _report(console, sent, before, client.status())
 
 
-def _paced(readings: Sequence[Reading], rate: float | None) -> Iterator[Reading]:
+def _paced(readings: Iterable[Reading], rate: float | None) -> Iterator[Reading]:
     """Yield readings when their time has come, at `rate` times real time; at once without it."""
     if rate is None:
         yield from readings
         return
-    started_s = time.monotonic()
+    zero_s: float | None = None
     for reading in readings:
-        due_s = started_s + (reading.stamp_s - readings[0].stamp_s) / rate
+        if zero_s is None:
+            zero_s = time.monotonic() - reading.stamp_s / rate
+        due_s = zero_s + reading.stamp_s / rate
         time.sleep(max(0.0, due_s - time.monotonic()))
         yield reading
 

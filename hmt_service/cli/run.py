@@ -10,26 +10,23 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from hmt_service.cli.recorded import print_contents, print_malformed
 from hmt_service.cli.settings import ConfigFile, PresetName, Seed, load_settings
 from hmt_service.core.config import Preset
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable
 
     from rich.console import Console
 
     from hmt_service.core.config import Config
     from hmt_service.core.engine import Engine
     from hmt_service.core.types import Reading
-    from hmt_service.io.logs import Log
     from hmt_service.runtime.messages import RunReport
-
-_SHOWN_LINES = 5
-"""Malformed lines that are printed one by one."""
 
 
 def run(
-    log: Annotated[Path, typer.Argument(help="Recorded log.")],
+    log: Annotated[Path, typer.Argument(help="Recorded log: CARMEN or MCAP.")],
     out: Annotated[Path, typer.Option(help="Folder to write trajectory, map and summary to.")],
     preset: PresetName = Preset.PLANAR,
     config: ConfigFile = None,
@@ -49,15 +46,16 @@ def run(
             min_range_m=settings.sensor.min_range_m,
             max_range_m=settings.sensor.max_range_m,
         )
-    _report_reading(console, recorded)
+    print_contents(console, recorded)
     engine, report = _map(recorded.readings, recorded.scans, settings, seed, console)
+    print_malformed(console, recorded)
     files = save_results(engine, report, directory=out, config=settings, seed=seed)
     _report_map(console, engine, report)
     console.print(f"saved {', '.join(files)} in {out}", soft_wrap=True)
 
 
 def _map(
-    readings: Sequence[Reading], scans: int, settings: Config, seed: int, console: Console
+    readings: Iterable[Reading], scans: int, settings: Config, seed: int, console: Console
 ) -> tuple[Engine, RunReport]:
     """Return the finished engine and what it has cost, with a progress bar meanwhile."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
@@ -69,18 +67,6 @@ def _map(
     with Progress(*columns, console=console) as progress:
         task = progress.add_task("mapping", total=scans)
         return map_readings(readings, settings, seed=seed, on_scan=lambda: progress.advance(task))
-
-
-def _report_reading(console: Console, log: Log) -> None:
-    console.print(f"{log.scans} scans, {len(log.readings) - log.scans} odometry readings")
-    if not log.malformed:
-        return
-    console.print(f"[yellow]{len(log.malformed)} malformed lines left out")
-    for line in log.malformed[:_SHOWN_LINES]:
-        console.print(f"  line {line.line}: {line.reason}", soft_wrap=True, markup=False)
-    if len(log.malformed) > _SHOWN_LINES:
-        numbers = ", ".join(str(line.line) for line in log.malformed[_SHOWN_LINES:])
-        console.print(f"  and lines {numbers}")
 
 
 def _report_map(console: Console, engine: Engine, report: RunReport) -> None:

@@ -39,22 +39,13 @@ from hmt_service.core.geometry import (
 )
 from hmt_service.core.types import OdometryReading, Reading, Scan
 from hmt_service.errors import InvalidLog
+from hmt_service.io.malformed import Malformed
 
 _WORDS_IN_CONFIG = 7
 _WORDS_IN_TIME = 3
 _WORDS_BETWEEN_POSES_AND_TIME = 5
 _GZIP_MAGIC = b"\x1f\x8b"
 _BZIP2_MAGIC = b"BZh"
-
-
-@dataclass(frozen=True, slots=True)
-class MalformedLine:
-    """A line that should hold a reading and does not."""
-
-    line: int
-    """Number of the line, from 1."""
-    reason: str
-    """What is wrong with it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,8 +60,10 @@ class CarmenLog:
     """Number of odometry readings among them, those that come with a scan included."""
     out_of_order: int
     """Number of scans that are older than the scan before them in the file."""
-    malformed: tuple[MalformedLine, ...]
+    malformed: tuple[Malformed, ...]
     """Lines that were left out, in the order of the file."""
+    unread: tuple[str, ...] = ()
+    """Empty: all readings are read."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +95,7 @@ def read_carmen(path: Path, *, min_range_m: float, max_range_m: float) -> Carmen
     limits = _Limits(min_range_m, max_range_m)
     readings: list[Reading] = []
     raw_scans: list[Reading] = []
-    malformed: list[MalformedLine] = []
+    malformed: list[Malformed] = []
     number = 0
     try:
         with _open(path) as file:
@@ -111,9 +104,9 @@ def read_carmen(path: Path, *, min_range_m: float, max_range_m: float) -> Carmen
                     target = raw_scans if line.startswith(b"RAWLASER1") else readings
                     target += _parse(line, limits)
                 except _Malformed as reason:
-                    malformed.append(MalformedLine(number, str(reason)))
+                    malformed.append(Malformed(f"line {number}", str(reason)))
     except _Malformed as reason:
-        malformed.append(MalformedLine(number + 1, str(reason)))
+        malformed.append(Malformed(f"line {number + 1}", str(reason)))
     except OSError as error:
         raise InvalidLog(f"cannot read {path}: {error.strerror}") from error
 

@@ -219,10 +219,11 @@ def _point_cloud(message: PointCloud, rules: _Rules) -> Decoded:
     body_from_sensor = _body_from_sensor(message, rules)
     rows = _rows(message)
     points = np.zeros((len(rows), 3))
-    for axis, name in enumerate("xyz"):
-        if name in _names(rows):
-            points[:, axis] = rows[name]
-    with np.errstate(over="ignore"):
+    # Huge numbers, and NaN that signal.
+    with np.errstate(over="ignore", invalid="ignore"):
+        for axis, name in enumerate("xyz"):
+            if name in _names(rows):
+                points[:, axis] = rows[name]
         ranges = np.linalg.norm(points, axis=1)
     # Organised clouds mark directions without a return by NaN: only a cloud of nothing else is
     # wrong.

@@ -5,28 +5,39 @@ References: own.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Protocol
 
 from hmt_service.core.types import Reading
 from hmt_service.errors import InvalidLog
-from hmt_service.io.carmen import MalformedLine, read_carmen
+from hmt_service.io.carmen import read_carmen
+from hmt_service.io.malformed import Malformed
+from hmt_service.io.mcap_log import read_mcap
 
 
 class Log(Protocol):
     """What every reader returns at least."""
 
     @property
-    def readings(self) -> tuple[Reading, ...]:
-        """Scans and odometry in the order of time."""
+    def readings(self) -> Iterable[Reading]:
+        """Scans and odometry in the order of time; may be iterated again and again."""
 
     @property
     def scans(self) -> int:
-        """Number of scans among them."""
+        """Number of scans among them, with those that will turn out to be malformed."""
 
     @property
-    def malformed(self) -> tuple[MalformedLine, ...]:
-        """What was left out, and why."""
+    def odometry(self) -> int:
+        """Number of odometry readings among them, in the same way."""
+
+    @property
+    def malformed(self) -> tuple[Malformed, ...]:
+        """What was left out, and why; complete after an iteration over the readings."""
+
+    @property
+    def unread(self) -> tuple[str, ...]:
+        """What else in the log could have been read."""
 
 
 class _Reader(Protocol):
@@ -37,6 +48,7 @@ _COMPRESSIONS = {".gz", ".bz2"}
 _READERS: dict[str, _Reader] = {
     ".clf": read_carmen,
     ".log": read_carmen,
+    ".mcap": read_mcap,
 }
 
 
@@ -51,7 +63,7 @@ def read_log(path: Path, *, min_range_m: float, max_range_m: float) -> Log:
     Raises:
         InvalidLog: If the format is unknown, the file cannot be opened or holds no usable scan.
     """
-    suffixes = [suffix for suffix in path.suffixes if suffix not in _COMPRESSIONS]
+    suffixes = [s for s in map(str.lower, path.suffixes) if s not in _COMPRESSIONS]
     suffix = suffixes[-1] if suffixes else ""
     reader = _READERS.get(suffix)
     if reader is None:

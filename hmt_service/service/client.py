@@ -138,8 +138,11 @@ class HmtClient:
         """Have the daemon save the map and end."""
         return self._call(self._keys.control(Control.SHUTDOWN), Ack)
 
-    def publish(self, reading: Reading) -> None:
+    def publish(self, reading: Reading) -> int:
         """Send a reading; waits while the network or the daemon is behind, and drops nothing.
+
+        Returns:
+            The size of what was sent, bytes.
 
         Raises:
             Unavailable: If nobody takes it.
@@ -147,6 +150,7 @@ class HmtClient:
         message = encode_reading(reading)
         name = Input.ODOMETRY if isinstance(reading, OdometryReading) else Input.SCAN
         self.publish_raw(name, message.payload, message.encoding)
+        return len(message.payload)
 
     def publish_raw(self, name: Input, payload: bytes, encoding: str) -> None:
         """Send any payload as a scan or as odometry.

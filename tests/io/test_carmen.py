@@ -194,7 +194,7 @@ def test_scan_without_returns_is_still_a_scan(tmp_path: Path) -> None:
 )
 def test_malformed_line_is_reported_and_costs_nothing_else(tmp_path: Path, line: str) -> None:
     log = read_lines(tmp_path, "# a comment", line, "", "PARAM laser on", flaser([1.0, 1.0]))
-    assert [malformed.line for malformed in log.malformed] == [2]
+    assert [malformed.place for malformed in log.malformed] == ["line 2"]
     assert log.malformed[0].reason
     assert (log.scans, log.odometry) == (1, 1)
 
@@ -225,7 +225,7 @@ def test_damaged_stream_keeps_what_came_before(tmp_path: Path) -> None:
     path.write_bytes(whole[: len(whole) // 2])
     log = read(path)
     assert 0 < log.scans < 500
-    assert log.malformed[-1].line == log.scans + 1
+    assert log.malformed[-1].place == f"line {log.scans + 1}"
     assert "compressed stream" in log.malformed[-1].reason
 
 

@@ -120,6 +120,14 @@ def test_coordinates_beyond_float_are_no_return() -> None:
     assert len(scan_of(cloud(points, "<f8")).points_in_body) == 1
 
 
+def test_a_coordinate_that_signals_nan_is_as_wrong_as_any_other() -> None:
+    message = cloud(np.ones((2, 3)))
+    message.data = b"\x01\x00\x80\x7f" + message.data[4:]
+    result = decoded(message)
+    assert isinstance(result, Decoded)
+    assert result.dropped_beams == {Defect.NAN_RANGES: 1}
+
+
 def test_odometry_is_taken_in_both_forms() -> None:
     pose = PoseMessage(position=Vector3(x=1.0), orientation=Quaternion(w=1.0))
     plain = PoseInFrame(timestamp=Timestamp(seconds=5), frame_id="odom", pose=pose)

@@ -8,6 +8,8 @@ import pytest
 
 from hmt_service.errors import InvalidLog
 from hmt_service.io.logs import read_log
+from hmt_service.io.mcap_log import McapWriter
+from tests.flat import readings
 
 
 @pytest.mark.parametrize(
@@ -17,10 +19,21 @@ def test_carmen_names_reach_the_carmen_reader(tmp_path: Path, name: str) -> None
     path = tmp_path / name
     path.write_text("FLASER 2 1 1 0 0 0 0 0 0 1 host 1\n")
     log = read_log(path, min_range_m=0.1, max_range_m=40.0)
-    assert (log.scans, len(log.readings)) == (1, 2)
+    assert (log.scans, log.odometry, len(list(log.readings))) == (1, 1, 2)
 
 
-@pytest.mark.parametrize("name", ["run.mcap", "run", "run.gz"])
+@pytest.mark.parametrize("name", ["run.mcap", "run.2024.MCAP"])
+def test_mcap_names_reach_the_mcap_reader(tmp_path: Path, name: str) -> None:
+    with (tmp_path / name).open("wb") as file:
+        writer = McapWriter(file)
+        for reading in readings(2):
+            writer.write(reading)
+        writer.finish()
+    log = read_log(tmp_path / name, min_range_m=0.1, max_range_m=40.0)
+    assert (log.scans, log.odometry, len(list(log.readings))) == (2, 2, 4)
+
+
+@pytest.mark.parametrize("name", ["run.bag", "run", "run.gz"])
 def test_unknown_format_is_refused_with_the_known_ones(tmp_path: Path, name: str) -> None:
-    with pytest.raises(InvalidLog, match=r"unknown format .*\.clf, \.log"):
+    with pytest.raises(InvalidLog, match=r"unknown format .*\.clf, \.log, \.mcap"):
         read_log(tmp_path / name, min_range_m=0.1, max_range_m=40.0)

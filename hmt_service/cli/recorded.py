@@ -1,0 +1,38 @@
+"""What every command that reads a log says about it.
+
+References: own.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from hmt_service.io.logs import Log
+
+_SHOWN = 5
+"""Malformed places that are printed with their reason."""
+
+
+def print_contents(console: Console, log: Log) -> None:
+    """Print what a log holds."""
+    console.print(f"{log.scans} scans, {log.odometry} odometry readings")
+    if log.unread:
+        console.print(f"not read: {', '.join(log.unread)}", soft_wrap=True, markup=False)
+
+
+def print_malformed(console: Console, log: Log) -> None:
+    """Print what was left out of a log while it was read."""
+    if not log.malformed:
+        return
+    total = sum(malformed.count for malformed in log.malformed)
+    console.print(f"[yellow]{total} malformed readings left out")
+    for malformed in log.malformed[:_SHOWN]:
+        times = f", {malformed.count} times" if malformed.count > 1 else ""
+        text = f"  {malformed.place}: {malformed.reason}{times}"
+        console.print(text, soft_wrap=True, markup=False)
+    if len(log.malformed) > _SHOWN:
+        places = ", ".join(malformed.place for malformed in log.malformed[_SHOWN:])
+        console.print(f"  and {places}", markup=False)
