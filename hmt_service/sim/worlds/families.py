@@ -14,6 +14,7 @@ from types import MappingProxyType
 from hmt_service.errors import InvalidInput
 from hmt_service.sim.worlds.aliased import aliased
 from hmt_service.sim.worlds.garage import garage
+from hmt_service.sim.worlds.long import long
 from hmt_service.sim.worlds.nested_loops import nested_loops
 from hmt_service.sim.worlds.office import office
 from hmt_service.sim.worlds.warehouse import warehouse
@@ -122,6 +123,12 @@ RECIPES: Mapping[Family, Recipe] = MappingProxyType(
             garage,
             (550.0, 650.0),
             (Parameter("floors", 2, 6, 3, "Number of floors.", is_whole=True),),
+        ),
+        Family.LONG: Recipe(
+            "Any number of small areas in rows, a loop in each row, to measure how cost grows.",
+            long,
+            (650.0, 850.0),
+            (Parameter("areas", 1, 100_000, 100, "Number of areas.", is_whole=True),),
         ),
     }
 )

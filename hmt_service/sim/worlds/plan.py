@@ -6,7 +6,7 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
@@ -118,9 +118,9 @@ def lanes(route: Sequence[tuple[float, float]], margin: float = CLEARANCE_M) -> 
     ]
 
 
-def on_floor(route: Iterable[tuple[float, float]]) -> FloatArray:
-    """Return the waypoints at height 0, shape (W, 3), each different from the one before."""
-    points = np.array([(x, y, 0.0) for x, y in route])
+def on_floor(route: Sequence[tuple[float, float]] | FloatArray) -> FloatArray:
+    """Return the waypoints, shape (W, 2), at height 0, each different from the one before."""
+    points = np.column_stack([np.asarray(route, dtype=np.float64), np.zeros(len(route))])
     is_new = np.any(np.diff(points, axis=0) != 0.0, axis=1)
     return np.vstack([points[:1], points[1:][is_new]])
 
