@@ -52,9 +52,10 @@ class Scores:
     log_loss: float
     """Mean negative log probability of what is right, nats; lower is better."""
     expected_calibration_error: float
-    """Mean difference of confidence and frequency over the bins, weighted by their counts."""
+    """Mean difference of confidence and frequency over the bins, weighted by their counts; 0 where
+    there are none."""
     bins: tuple[Bin, ...]
-    """The bins that hold any decision, by confidence."""
+    """The bins that hold any decision with one answer, by confidence."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,6 +102,14 @@ def is_contested(decision: Decision) -> bool:
     return decision.is_return or top.is_known or top.probability <= _CERTAIN
 
 
+def has_one_answer(decision: Decision) -> bool:
+    """Return whether no two options are right: where two are, neither can be too firmly believed.
+
+    Such decisions cost nothing in the scores and say nothing about calibration.
+    """
+    return sum(option.is_right for option in decision.options) <= 1
+
+
 def score(decisions: Sequence[Decision]) -> Scores:
     """Return what decisions are worth.
 
@@ -109,21 +118,16 @@ def score(decisions: Sequence[Decision]) -> Scores:
     """
     if not decisions:
         raise InvalidInput("no decision to score")
-    bins = reliability(
-        [d.options[0].probability for d in decisions], [_is_right(d) for d in decisions]
-    )
+    tops = [decision.options[0] for decision in decisions if has_one_answer(decision)]
+    bins = reliability([top.probability for top in tops], [top.is_right for top in tops])
+    gap = sum(abs(one.right - one.count * one.confidence) for one in bins)
     return Scores(
         decisions=len(decisions),
         brier=float(np.mean([brier(decision) for decision in decisions])),
         log_loss=float(np.mean([log_loss(decision) for decision in decisions])),
-        expected_calibration_error=sum(abs(one.right - one.count * one.confidence) for one in bins)
-        / len(decisions),
+        expected_calibration_error=gap / max(len(tops), 1),
         bins=bins,
     )
-
-
-def _is_right(decision: Decision) -> bool:
-    return decision.options[0].is_right
 
 
 def reliability(confidences: Sequence[float], is_right: Sequence[bool]) -> tuple[Bin, ...]:

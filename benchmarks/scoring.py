@@ -30,8 +30,12 @@ A decision is what is believed of one visit when it has just been over: hypothes
 of the visit (the same area at the same pose, within the tolerance, or a new area) are one option,
 which is as right as its most probable hypothesis and as probable as all of them.
 
+Both a known area and a new one may be right: a visit that begins in the unknown and ends in a known
+place, or beside an area that is in sight, has no single true answer.
+
 What this cannot see: a loop inside one visit or back into the area just left, and whether an area
-is of a sensible size.
+is of a sensible size. `placement` does not care where borders are: of the keyframes that return,
+how many does a map place rightly relative to where the place was seen before?
 
 References:
     Blanco et al. 2008, Eq. (14) (probabilities of topological paths); the scoring is own.
@@ -124,6 +128,16 @@ class Decision:
     """Whether it is a true return."""
 
 
+@dataclass(frozen=True, slots=True)
+class Placement:
+    """How a map places the keyframes that return."""
+
+    returning: int
+    """How many keyframes return."""
+    right: int
+    """How many of them are where the map says, relative to the keyframe seen before."""
+
+
 def judge(journey: Journey, topology: Topology, visit: int) -> Verdict:
     """Return what the assignment of one visit is."""
     area = topology.areas[visit]
@@ -161,7 +175,7 @@ def decide(journey: Journey, topologies: Sequence[Topology], visit: int) -> Deci
             group.append(topology)
     options = [
         Option(
-            probability=sum(topology.probability for topology in group),
+            probability=math.fsum(topology.probability for topology in group),
             is_known=group[0].areas[visit] != visit,
             is_right=judge(journey, group[0], visit) is Verdict.RIGHT,
         )
@@ -175,6 +189,34 @@ def always_new(journey: Journey, visit: int) -> Decision:
     """Return the decision of a filter that is certain that every area is new."""
     is_return = is_true_return(journey, visit)
     return Decision((Option(1.0, is_known=False, is_right=not is_return),), is_return)
+
+
+def placement(journey: Journey, reference_from_keyframe: FloatArray) -> Placement:
+    """Return how a map places the keyframes that return.
+
+    Each is compared with the keyframe that was really nearest to it, of those that make it return.
+
+    Args:
+        journey: The truth.
+        reference_from_keyframe: Pose of each keyframe in the map, shape (K, 4, 4).
+    """
+    world_from_keyframe = journey.world_from_keyframe
+    returning = right = 0
+    for k, place in enumerate(journey.place):
+        is_away = journey.travelled_m[k] - journey.travelled_m[:k] >= AWAY_M
+        before = np.flatnonzero(is_away & (journey.place[:k] == place))
+        if not len(before):
+            continue
+        apart = np.linalg.norm(
+            world_from_keyframe[before, :3, 3] - world_from_keyframe[k, :3, 3], axis=1
+        )
+        nearest = before[np.argmin(apart)]
+        returning += 1
+        right += _agree(
+            inverse(world_from_keyframe[nearest]) @ world_from_keyframe[k],
+            inverse(reference_from_keyframe[nearest]) @ reference_from_keyframe[k],
+        )
+    return Placement(returning, right)
 
 
 def _returns(journey: Journey, visit: int, just_left: Collection[int]) -> bool:

@@ -98,6 +98,16 @@ def test_the_scores_are_proper() -> None:
             assert expected(chances + gap, loss) > honest
 
 
+def test_two_right_options_say_nothing_about_calibration() -> None:
+    """Without the middle one: 1 right of 2 at 0.8."""
+    either = decision((0.5, True), (0.5, True))
+    scores = score([decision((0.8, True), (0.2, False)), either, decision((0.8, False))])
+    assert scores.decisions == 3
+    assert scores.bins == (Bin(2, 0.8, 1),)
+    assert scores.expected_calibration_error == pytest.approx(0.3)
+    assert score([either]).expected_calibration_error == 0.0
+
+
 def test_what_is_contested() -> None:
     def single(p: float, *, is_known: bool, is_return: bool) -> Decision:
         rest = Option(1.0 - p, is_known=True, is_right=False)

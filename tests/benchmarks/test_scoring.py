@@ -12,6 +12,7 @@ from benchmarks.scoring import (
     Decision,
     Journey,
     Option,
+    Placement,
     Topology,
     Verdict,
     always_new,
@@ -19,6 +20,7 @@ from benchmarks.scoring import (
     is_true_return,
     judge,
     judge_all,
+    placement,
 )
 from hmt_service.core.geometry import FloatArray, inverse, planar_pose
 
@@ -173,6 +175,17 @@ def test_half_of_the_keyframes_make_a_return(*, known: int, is_return: bool) -> 
     known_places, new_places = [0.5] * known, [100.5] * (4 - known)
     travelled = line([0.0, 1.0, 50.0, 51.0, *known_places, *new_places], [0, 2, 4])
     assert is_true_return(travelled, 2) is is_return
+
+
+def test_placement_asks_each_keyframe_that_returns_wherever_the_borders_are() -> None:
+    """Ten keyframes return; the last four of them are 1.6 m from where they really are."""
+    true_poses = RING.world_from_keyframe
+    assert placement(RING, true_poses) == Placement(10, 10)
+    poses = true_poses.copy()
+    poses[26:] = poses[26:] @ planar_pose(1.6, 0.0, 0.0)
+    assert placement(ring(30, [0]), poses) == Placement(10, 6)
+    elsewhere = planar_pose(50.0, -20.0, 1.0) @ true_poses
+    assert placement(RING, elsewhere) == Placement(10, 10)
 
 
 def test_one_option_per_place_that_hypotheses_tell_apart() -> None:

@@ -1,0 +1,183 @@
+"""What the probabilities of topologies are worth, over many drawn worlds of known topology.
+
+What is right is defined in `benchmarks.scoring`, what it scores in `benchmarks.calibration`.
+
+References:
+    Blanco et al. 2008, Eq. (14) (probabilities of topological paths).
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.belief_figures import draw_p_true, draw_reliability
+from benchmarks.calibration import consistency, is_contested, score
+from benchmarks.cells import Result
+from benchmarks.metric import Direction, Metric
+from benchmarks.report import Report, Run
+from benchmarks.scoring import Decision
+from benchmarks.world_belief import WorldBelief, as_result, believe, from_result
+from hmt_service.core.config import Preset, load_config
+from hmt_service.sim.simulation import (
+    INDOOR_LASER,
+    LIDAR,
+    OUTDOOR_LASER,
+    SHORT_SIGHTED,
+    Robot,
+    simulate,
+)
+from hmt_service.sim.worlds.families import Family, draw
+
+_ROBOTS: Mapping[Family, tuple[Robot, Preset]] = {
+    Family.OFFICE: (INDOOR_LASER, Preset.PLANAR),
+    Family.ALIASED: (SHORT_SIGHTED, Preset.PLANAR),
+    Family.NESTED_LOOPS: (SHORT_SIGHTED, Preset.PLANAR),
+    Family.WAREHOUSE: (SHORT_SIGHTED, Preset.PLANAR),
+    Family.GARAGE: (LIDAR, Preset.SPATIAL),
+    Family.CAMPUS: (OUTDOOR_LASER, Preset.PLANAR),
+}
+_FULL: Mapping[Family, Sequence[int]] = {
+    Family.OFFICE: range(10),
+    Family.ALIASED: range(10),
+    Family.NESTED_LOOPS: range(10),
+    Family.WAREHOUSE: range(10),
+    Family.GARAGE: range(5),
+    Family.CAMPUS: range(2),
+}
+"""Seeds of the worlds of each family."""
+_QUICK: Mapping[Family, Sequence[int]] = {Family.OFFICE: (0,), Family.ALIASED: (1,)}
+_ALL = "all"
+# Few worlds: one that turns over must not fail the gate, several must.
+_RIGHT_TOLERANCE = 0.2
+_LOOPS_TOLERANCE = 0.3
+_SCORE_TOLERANCE = 0.3
+_ERROR_TOLERANCE = 0.5
+_COVERAGE_TOLERANCE = 0.1
+_LOWER, _HIGHER = Direction.LOWER_IS_BETTER, Direction.HIGHER_IS_BETTER
+
+
+def measure(run: Run) -> Report:
+    """Map worlds of all families and score what was believed of them."""
+    worlds = _QUICK if run.is_quick else _FULL
+    units = {
+        f"{family}/{seed}": partial(_believe, family, seed)
+        for family, seeds in worlds.items()
+        for seed in seeds
+    }
+    results = run.once_each(units, jobs=os.cpu_count() or 1)
+    beliefs = {
+        family: [from_result(results[f"{family}/{seed}"]) for seed in seeds]
+        for family, seeds in worlds.items()
+    }
+    return report_of(beliefs, run.out)
+
+
+def _believe(family: Family, seed: int) -> Result:
+    robot, preset = _ROBOTS[family]
+    return as_result(believe(simulate(draw(family, seed), robot, seed), load_config(preset)))
+
+
+def report_of(beliefs: Mapping[Family, Sequence[WorldBelief]], out: Path) -> Report:
+    """Return the numbers and figures of what was believed of some worlds.
+
+    Args:
+        beliefs: Worlds by family; at least one of each, with at least two visits.
+        out: Folder for the figures.
+    """
+    everything = [belief for worlds in beliefs.values() for belief in worlds]
+    decisions = [decision for belief in everything for decision in belief.decisions]
+    contested = [decision for decision in decisions if is_contested(decision)]
+    metrics = [*_topologies(_ALL, everything), *_scores(_ALL, decisions, is_gated=True)]
+    skipped = []
+    if contested:
+        metrics += _scores(f"{_ALL}/contested", contested, is_gated=True)
+    else:
+        skipped.append(f"{_ALL}/contested: none of {len(decisions)} decisions is")
+    metrics += _always_new(everything)
+    for family, worlds in beliefs.items():
+        of_family = [decision for belief in worlds for decision in belief.decisions]
+        # Scores of a family that is nearly always right are too small for a share of them.
+        metrics += [*_topologies(family, worlds), *_scores(family, of_family, is_gated=False)]
+    for preset, is_planar in ((Preset.PLANAR, True), (Preset.SPATIAL, False)):
+        of_preset = [belief for belief in everything if belief.is_planar is is_planar]
+        for what, errors in _errors(of_preset).items():
+            if errors:
+                metrics += _consistency(f"nees_{preset}/{what}", errors, is_planar=is_planar)
+            elif of_preset:
+                skipped.append(f"nees_{preset}/{what}: {len(of_preset)} maps, none of them right")
+    panels = {"All": score(decisions)} | ({"Contested": score(contested)} if contested else {})
+    figures = out / "reliability.png", out / "p_true.png"
+    draw_reliability(panels, figures[0])
+    draw_p_true({str(family): worlds for family, worlds in beliefs.items()}, figures[1])
+    return Report(tuple(metrics), tuple(skipped), figures)
+
+
+def _topologies(name: str, worlds: Sequence[WorldBelief]) -> Iterator[Metric]:
+    """Yield what the topologies are at the end."""
+    p_true = float(np.mean([world.p_true for world in worlds]))
+    map_right = float(np.mean([world.is_map_right for world in worlds]))
+    loops_tolerance = _LOOPS_TOLERANCE if name == _ALL else None
+    yield Metric(f"{name}/worlds", float(len(worlds)), "1", _HIGHER, 0.0)
+    yield Metric(f"{name}/p_true", p_true, "1", _HIGHER, _RIGHT_TOLERANCE)
+    yield Metric(f"{name}/map_right", map_right, "1", _HIGHER, _RIGHT_TOLERANCE)
+    returns = float(sum(world.true_returns for world in worlds))
+    yield Metric(f"{name}/true_returns", returns, "1", _HIGHER, None)
+    returning = sum(world.placement.returning for world in worlds)
+    if returning:
+        right = sum(world.placement.right for world in worlds) / returning
+        yield Metric(f"{name}/placed_right", right, "1", _HIGHER, _RIGHT_TOLERANCE)
+    for what, loops in (
+        ("false_loops", float(sum(world.false_loops for world in worlds))),
+        ("missed_loops", float(sum(world.missed_loops for world in worlds))),
+    ):
+        yield Metric(f"{name}/{what}", loops, "1", _LOWER, None)
+        if returns:
+            yield Metric(f"{name}/{what}_per_return", loops / returns, "1", _LOWER, loops_tolerance)
+
+
+def _scores(name: str, decisions: Sequence[Decision], *, is_gated: bool) -> Iterator[Metric]:
+    """Yield what decisions are worth."""
+    scores = score(decisions)
+    yield Metric(f"{name}/decisions", float(scores.decisions), "1", _HIGHER, None)
+    for what, value, unit, tolerance in (
+        ("brier", scores.brier, "1", _SCORE_TOLERANCE),
+        ("log_loss", scores.log_loss, "nat", _SCORE_TOLERANCE),
+        ("calibration_error", scores.expected_calibration_error, "1", _ERROR_TOLERANCE),
+    ):
+        yield Metric(f"{name}/{what}", value, unit, _LOWER, tolerance if is_gated else None)
+
+
+def _always_new(worlds: Sequence[WorldBelief]) -> Iterator[Metric]:
+    """Yield what a filter that is certain of new areas would have got, on the same visits."""
+    decisions = [decision for world in worlds for decision in world.decisions_always_new]
+    is_right = [not world.true_returns for world in worlds]
+    yield Metric("always_new/map_right", float(np.mean(is_right)), "1", _HIGHER, None)
+    returning = sum(world.placement_odometry.returning for world in worlds)
+    if returning:
+        right = sum(world.placement_odometry.right for world in worlds) / returning
+        yield Metric("always_new/placed_right", right, "1", _HIGHER, None)
+    for metric in _scores("always_new", decisions, is_gated=False):
+        if not metric.key.endswith("/decisions"):
+            yield metric
+
+
+def _errors(worlds: Sequence[WorldBelief]) -> Mapping[str, list[float]]:
+    """Return the normalised errors of all worlds by what they are of."""
+    return {
+        "odometry": [error for world in worlds for error in world.odometry_errors],
+        "arcs": [error for world in worlds for error in world.arc_errors],
+        "areas": [error for world in worlds for error in world.area_errors],
+    }
+
+
+def _consistency(name: str, errors: Sequence[float], *, is_planar: bool) -> Iterator[Metric]:
+    found = consistency(errors, is_planar=is_planar)
+    yield Metric(f"{name}/count", float(found.count), "1", _HIGHER, None)
+    yield Metric(f"{name}/mean", found.mean, "1", _LOWER, _ERROR_TOLERANCE)
+    yield Metric(f"{name}/median", found.median, "1", _LOWER, _ERROR_TOLERANCE)
+    yield Metric(f"{name}/coverage", found.coverage, "1", _HIGHER, _COVERAGE_TOLERANCE)
