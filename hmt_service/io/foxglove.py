@@ -178,7 +178,8 @@ def encode(
     points = len(reading.points_in_body)
     # A cloud of nothing is a broken sensor's; a scan without a return is a direction without one.
     data = np.full((max(1, points), len(names)), np.inf, np.dtype(numbers).newbyteorder("<"))
-    data[:points, :3] = reading.points_in_body - reading.sensor_in_body
+    for axis in range(3):  # one after the other takes a quarter of the time
+        data[:points, axis] = reading.points_in_body[:, axis] - reading.sensor_in_body[axis]
     if reading.point_times is not None:
         data[:points, 3] = reading.point_times
     return PointCloud(
