@@ -1,4 +1,4 @@
-"""Accuracy of the map over ground-truth relations of recorded logs, and what it costs.
+"""Accuracy of the map: recorded logs by relations, simulated worlds by their true trajectory.
 
 References:
     Kümmerle et al., On measuring the accuracy of SLAM algorithms, Autonomous Robots 27, 2009.
@@ -7,24 +7,51 @@ References:
 from __future__ import annotations
 
 import math
+import os
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import asdict
+from functools import partial
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
+from pydantic import TypeAdapter
 
+from benchmarks.cells import Result
 from benchmarks.metric import Direction, Metric
 from benchmarks.recordings import Missing, first_scans, read_recorded, recorded_file
 from benchmarks.report import Report, Run
+from benchmarks.trajectories import (
+    TrajectoryErrors,
+    mean_errors,
+    metrics_of,
+    trajectory_errors,
+)
 from hmt_service.core.config import load_config
 from hmt_service.core.engine import Engine
-from hmt_service.core.types import StampedPose
+from hmt_service.core.types import Reading, StampedPose
 from hmt_service.io.relations import ErrorStatistics, Relations, evaluate, read_relations
 from hmt_service.runtime.messages import RunReport
 from hmt_service.runtime.offline import map_readings
+from hmt_service.sim.simulation import Instant, simulate
+from hmt_service.sim.usual import USUAL_ROBOTS, preset_for
+from hmt_service.sim.worlds.families import Family, draw
 
 _LOGS = ("intel", "fr079", "aces")
 _QUICK_SCANS = 2_000
+_WORLDS = {
+    Family.OFFICE: 3,
+    Family.ALIASED: 3,
+    Family.NESTED_LOOPS: 3,
+    Family.WAREHOUSE: 3,
+    Family.CAMPUS: 1,
+    Family.GARAGE: 1,
+}
+"""How many worlds of each family, from seed 0."""
+_QUICK_WORLDS = {Family.OFFICE: 1, Family.ALIASED: 1}
+_QUICK_WORLD_SCANS = 400
+_REPORT = TypeAdapter(Report)
 _TOLERANCE_S = 0.005
 # Least and largest time between the two poses of a relation, both excluded, s.
 _GROUPS = {"all": (-1.0, math.inf), "over_60s": (60.0, math.inf), "under_20s": (-1.0, 20.0)}
@@ -36,31 +63,69 @@ _LOWER, _HIGHER = Direction.LOWER_IS_BETTER, Direction.HIGHER_IS_BETTER
 
 
 def measure(run: Run) -> Report:
-    """Map every recorded log that is there."""
+    """Map every recorded log that is there, and some worlds of every family."""
+    reports = [_measure_recorded(run, name) for name in _LOGS]
+    reports.append(measure_simulated(run))
+    return Report(
+        tuple(metric for report in reports for metric in report.metrics),
+        tuple(sentence for report in reports for sentence in report.skipped),
+    )
+
+
+# ------------------------------------------------------------------ simulated worlds
+
+
+def measure_simulated(run: Run) -> Report:
+    """Map some worlds of every family."""
+    worlds, scans = (_QUICK_WORLDS, _QUICK_WORLD_SCANS) if run.is_quick else (_WORLDS, None)
+    units = {
+        f"{family}/{seed}": partial(_map_world, family, seed, scans)
+        for family, count in worlds.items()
+        for seed in range(count)
+    }
+    results = run.once_each(units, jobs=os.cpu_count() or 1)
     metrics: list[Metric] = []
-    skipped: list[str] = []
-    for name in _LOGS:
-        log, truth = recorded_file(f"{name}.clf.bz2"), recorded_file(f"{name}.relations")
-        if isinstance(log, Missing):
-            skipped.append(f"{name}: {log.reason}")
-            continue
-        if isinstance(truth, Missing):
-            skipped.append(f"{name}: {truth.reason}")
-            continue
-        report = _measure_log(run, name, log, read_relations(truth))
-        metrics += report.metrics
-        skipped += report.skipped
-    return Report(tuple(metrics), tuple(skipped))
+    for family, count in worlds.items():
+        each = [TrajectoryErrors(**results[f"{family}/{seed}"]) for seed in range(count)]
+        metrics += metrics_of(f"simulated/{family}", mean_errors(each))
+    return Report(tuple(metrics))
 
 
-def _measure_log(run: Run, name: str, path: Path, relations: Relations) -> Report:
-    config = load_config()
-    run.say(f"{name}: reading")
+def _map_world(family: Family, seed: int, scans: int | None) -> Result:
+    robot = USUAL_ROBOTS[family]
+    instants = islice(simulate(draw(family, seed), robot, seed), scans)
+    truth: list[StampedPose] = []
+    engine, _ = map_readings(_readings(instants, truth), load_config(preset_for(robot)))
+    return asdict(trajectory_errors(engine.trajectory(), truth))
+
+
+def _readings(instants: Iterable[Instant], truth: list[StampedPose]) -> Iterator[Reading]:
+    """Yield what the robot sends, and note where it is."""
+    for instant in instants:
+        truth.append(instant.truth)
+        yield from instant.readings
+
+
+# ------------------------------------------------------------------ recorded logs
+
+
+def _measure_recorded(run: Run, name: str) -> Report:
+    log, truth = recorded_file(f"{name}.clf.bz2"), recorded_file(f"{name}.relations")
+    if isinstance(log, Missing):
+        return Report((), (f"{name}: {log.reason}",))
+    if isinstance(truth, Missing):
+        return Report((), (f"{name}: {truth.reason}",))
+    run.say(name)
+    result = run.once(f"recorded/{name}", partial(_map_log, name, log, truth, run.is_quick))
+    return _REPORT.validate_python(result)
+
+
+def _map_log(name: str, log: Path, truth: Path, is_quick: bool) -> Result:
+    config, relations = load_config(), read_relations(truth)
     started = time.perf_counter()
-    recorded = read_recorded(path, config)
+    recorded = read_recorded(log, config)
     read_s = time.perf_counter() - started
-    readings = first_scans(recorded, _QUICK_SCANS if run.is_quick else None)
-    run.say(f"{name}: mapping")
+    readings = first_scans(recorded, _QUICK_SCANS if is_quick else None)
     engine, cost = map_readings(readings, config)
     trajectory = engine.trajectory()
     recorded_s = readings[-1].stamp_s - readings[0].stamp_s
@@ -75,7 +140,8 @@ def _measure_log(run: Run, name: str, path: Path, relations: Relations) -> Repor
         matched = float(errors.matched)
         metrics.append(Metric(f"{name}/{group}/relations", matched, "1", _HIGHER, 0.0))
         metrics += _errors(f"{name}/{group}", errors.all_pairs)
-    return Report(tuple(metrics), tuple(skipped))
+    result: Result = _REPORT.dump_python(Report(tuple(metrics), tuple(skipped)), mode="json")
+    return result
 
 
 def _covered(

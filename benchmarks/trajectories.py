@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from statistics import fmean
 
 import numpy as np
 from evo.core.filters import FilterException
@@ -79,6 +80,17 @@ def trajectory_errors(
         absolute_max_m=float(absolute.get_statistic(StatisticsType.max)),
         relative_m=relative[0],
         relative_deg=relative[1],
+    )
+
+
+def mean_errors(errors: Sequence[TrajectoryErrors]) -> TrajectoryErrors:
+    """Return the errors of several trajectories as one: means, but all poses and the largest."""
+    return TrajectoryErrors(
+        matched=sum(each.matched for each in errors),
+        absolute_rmse_m=fmean(each.absolute_rmse_m for each in errors),
+        absolute_max_m=max(each.absolute_max_m for each in errors),
+        relative_m=fmean(each.relative_m for each in errors),
+        relative_deg=fmean(each.relative_deg for each in errors),
     )
 
 

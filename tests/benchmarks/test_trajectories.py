@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from benchmarks.trajectories import TrajectoryErrors, metrics_of, trajectory_errors
+from benchmarks.trajectories import TrajectoryErrors, mean_errors, metrics_of, trajectory_errors
 from hmt_service.core.geometry import FloatArray, Pose, planar_pose
 from hmt_service.core.types import StampedPose
 from hmt_service.errors import InvalidInput
@@ -78,6 +78,15 @@ def test_a_path_shorter_than_the_relative_distance_cannot_be_judged() -> None:
     path = square_path()[:10]
     with pytest.raises(InvalidInput, match="cannot be compared"):
         trajectory_errors(stamped(path), stamped(path))
+
+
+def test_several_trajectories_are_as_bad_as_their_mean_and_their_worst_pose() -> None:
+    errors = [TrajectoryErrors(5, 0.1, 0.9, 0.3, 2.0), TrajectoryErrors(7, 0.3, 0.4, 0.5, 1.0)]
+    mean = mean_errors(errors)
+    assert (mean.matched, mean.absolute_max_m) == (12, 0.9)
+    assert (mean.absolute_rmse_m, mean.relative_m, mean.relative_deg) == pytest.approx(
+        (0.2, 0.4, 1.5)
+    )
 
 
 def test_every_error_has_a_unit() -> None:
