@@ -13,6 +13,7 @@ from types import MappingProxyType
 
 from hmt_service.errors import InvalidInput
 from hmt_service.sim.worlds.aliased import aliased
+from hmt_service.sim.worlds.campus import campus
 from hmt_service.sim.worlds.garage import garage
 from hmt_service.sim.worlds.long import long
 from hmt_service.sim.worlds.nested_loops import nested_loops
@@ -112,6 +113,12 @@ RECIPES: Mapping[Family, Recipe] = MappingProxyType(
             nested_loops,
             (550.0, 800.0),
             (_LAPS,),
+        ),
+        Family.CAMPUS: Recipe(
+            "2 km of paths between buildings, trees and cars, and through three halls, over hills.",
+            campus,
+            (1800.0, 2200.0),
+            (Parameter("relief_m", 0, 4, 1.5, "Greatest height over the mean; 0 is flat."),),
         ),
         Family.WAREHOUSE: Recipe(
             "Rows of equal racks with loads that vary a little, cross aisles, docks.",

@@ -83,7 +83,7 @@ class _Rows:
     @property
     def is_eastward(self) -> npt.NDArray[np.bool_]:
         """Whether the route runs east through each area, shape (N,)."""
-        return self.row % 2 == 0
+        return np.asarray(self.row % 2 == 0)
 
     @property
     def seen_in_loops(self) -> npt.NDArray[np.int64]:

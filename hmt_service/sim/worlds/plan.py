@@ -6,6 +6,7 @@ References:
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -211,12 +212,21 @@ def joined(meshes: Sequence[Mesh]) -> Mesh:
     )
 
 
-def walls_around(free: Sequence[Box], height: float = CEILING_M) -> Mesh:
+def placed(mesh: Mesh, x: float, y: float, z: float, yaw_rad: float = 0.0) -> Mesh:
+    """Return a mesh turned about the upright axis of the origin, then shifted."""
+    cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
+    turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+    vertices = mesh.vertices @ turn.T + (x, y, z)
+    return Mesh(vertices.astype(np.float32), mesh.triangles)
+
+
+def walls_around(free: Sequence[Box], height: float = CEILING_M, *, is_open: bool = False) -> Mesh:
     """Return the walls of a building as a robot inside sees them: the border of all free space.
 
     Args:
         free: Ground of corridors, rooms and doorways; what they share is one space.
         height: Of the walls, which stand at height 0.
+        is_open: Whether there are no walls on the rectangle around all of it.
     """
     ground = np.array([(box.x_min, box.y_min, box.x_max, box.y_max) for box in free])
     ground = np.round(ground / _RASTER_M) * _RASTER_M
@@ -231,7 +241,11 @@ def walls_around(free: Sequence[Box], height: float = CEILING_M) -> Mesh:
     along_y = np.stack([np.column_stack([x, low]), np.column_stack([x, high])], axis=1)
     y, low, high = _borders(is_free.T, ys, xs)
     along_x = np.stack([np.column_stack([low, y]), np.column_stack([high, y])], axis=1)
-    return fences(np.concatenate([along_y, along_x]), height)
+    walls = np.concatenate([along_y, along_x])
+    if is_open:
+        is_outermost = (walls == (xs[0], ys[0])) | (walls == (xs[-1], ys[-1]))
+        walls = walls[~is_outermost.all(axis=1).any(axis=1)]
+    return fences(walls, height)
 
 
 def interior(free: Sequence[Box], standing: Sequence[Box], height: float = CEILING_M) -> Mesh:
