@@ -298,7 +298,7 @@ def _latency_metrics(cost: Result, loads: Mapping[str, Result]) -> Iterator[Metr
 def _draw(loads: Mapping[str, Result], path: Path) -> None:
     """Draw the share of answers that came within a time: one panel per kind of wait."""
     figure = Figure(figsize=(13.0, 4.8), layout="constrained")
-    panels = figure.subplots(1, len(_PANELS), sharey=True)
+    panels = figure.subplots(1, len(_PANELS), sharex=True, sharey=True)
     for axes, (title, styles) in zip(panels, _PANELS.items(), strict=True):
         for kind, style in styles.items():
             states = {load: result["load"] for load, result in loads.items()}
