@@ -10,6 +10,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from hmt_service.core.geometry import FloatArray
 from hmt_service.errors import InvalidInput
@@ -64,59 +65,72 @@ class Crowd:
             raise InvalidInput(f"{people} people")
         legs = np.diff(route_m, axis=0)
         lengths = np.linalg.norm(legs[:, :2], axis=1)
-        self._route_m = route_m
+        self._heights_m = route_m[:, 2]
+        self._route = route_m[:, 0] + 1j * route_m[:, 1]
         self._travelled = np.concatenate([[0.0], np.cumsum(lengths)])
         self._people = _drawn(legs[:, :2] / lengths[:, None], self._travelled, people, rng)
+        # Nobody goes farther from the middle of the stretch than half its length.
+        middles = np.array([each.start_m + each.length_m / 2 for each in self._people])
+        level = self._level(middles)
+        self._middles_m = np.column_stack([level.real, level.imag])
+        self._radii_m = np.array([each.length_m / 2 + BESIDE_M + RADIUS_M for each in self._people])
 
-    def ranges(self, fans: Fans, stamps_s: FloatArray, reach_m: float) -> FloatArray:
-        """Return how far the first person is along each ray, shape (M, R), m; infinite: none.
+    def occlude(
+        self, ranges: npt.NDArray[np.float32], fans: Fans, times_s: FloatArray, reach_m: float
+    ) -> None:
+        """Shorten the ranges of rays that meet somebody.
 
-        A person whom the origin of a ray is inside of is not seen by it.
+        A ray that starts inside a person does not meet that person.
 
         Args:
-            fans: Rays.
-            stamps_s: Time of each fan, shape (M,).
+            ranges: How far the world is along each ray, shape (S, C, R), m; changed in place.
+            fans: The rays.
+            times_s: When each fan is taken, shape (S, P).
             reach_m: People farther away may be left out.
         """
-        ranges = np.full((len(stamps_s), len(fans.elevations_rad)), np.inf)
-        for person in self._people:
-            if not self._may_be_near(person, fans.origins_m, reach_m):
-                continue
-            middles = self._at(person, stamps_s)
-            middles[:, 2] += HEIGHT_M / 2
-            (seen,) = np.nonzero(_may_meet(fans, middles, reach_m))
-            ranges[seen] = np.minimum(ranges[seen], _cylinder_ranges(fans, seen, middles[seen]))
-        return ranges
+        near = self._near(fans.origins_m, reach_m)
+        if not near:
+            return
+        normals = np.cross(fans.forward, fans.up)
+        beside_m, behind_m = _extents(normals), _extents(fans.forward)
+        for person in near:
+            ways = self._at(person, times_s) + (0.0, 0.0, HEIGHT_M / 2) - fans.origins_m
+            # A fan lies in a half-plane. It misses somebody who is beside the plane or behind the
+            # origin altogether.
+            may_meet = np.abs(_dot(normals, ways)) <= beside_m
+            may_meet &= _dot(fans.forward, ways) >= -behind_m
+            may_meet &= _dot(ways, ways) <= (reach_m + HEIGHT_M) ** 2
+            ways, up = (np.broadcast_to(each, normals.shape)[may_meet] for each in (ways, fans.up))
+            ahead = _cylinder_ranges(ways, fans.forward[may_meet], up, fans.elevations_rad)
+            ranges[may_meet] = np.minimum(ranges[may_meet], ahead)
 
     def positions(self, stamp_s: float) -> FloatArray:
         """Return where the feet of all people are at a time, shape (N, 3), m."""
-        at = np.array([stamp_s])
-        return np.array([self._at(person, at)[0] for person in self._people]).reshape(-1, 3)
+        at = np.array(stamp_s)
+        return np.array([self._at(person, at) for person in self._people]).reshape(-1, 3)
 
-    def _at(self, person: _Person, stamps_s: FloatArray) -> FloatArray:
-        """Return where the feet of a person are, shape (M, 3)."""
-        walked = (person.phase_m + person.speed_m_s * stamps_s) % (2.0 * person.length_m)
+    def _near(self, origins_m: FloatArray, reach_m: float) -> list[_Person]:
+        """Return those whose stretch is within reach of any origin, and perhaps a few more."""
+        level = origins_m[..., :2]
+        nearest = np.clip(self._middles_m, level.min(axis=(0, 1)), level.max(axis=(0, 1)))
+        gaps = np.linalg.norm(self._middles_m - nearest, axis=1)
+        return [self._people[each] for each in np.flatnonzero(gaps <= reach_m + self._radii_m)]
+
+    def _at(self, person: _Person, times_s: FloatArray) -> FloatArray:
+        """Return where the feet of a person are, shape (...) -> (..., 3)."""
+        walked = (person.phase_m + person.speed_m_s * times_s) % (2.0 * person.length_m)
         along = person.start_m + np.minimum(walked, 2.0 * person.length_m - walked)
-        feet = self._along(along)
         # A stride back and forth, so that nobody jumps sideways where the route bends.
-        heading = (self._along(along + _STRIDE_M) - self._along(along - _STRIDE_M))[:, :2]
-        heading /= np.linalg.norm(heading, axis=1, keepdims=True)
-        feet[:, 0] -= person.side * BESIDE_M * heading[:, 1]
-        feet[:, 1] += person.side * BESIDE_M * heading[:, 0]
-        return feet
+        ends = person.start_m, person.start_m + person.length_m
+        ahead, behind = (np.clip(along + step, *ends) for step in (_STRIDE_M, -_STRIDE_M))
+        heading = self._level(ahead) - self._level(behind)
+        level = self._level(along) + 1j * person.side * BESIDE_M * heading / np.abs(heading)
+        height = np.interp(along, self._travelled, self._heights_m)
+        return np.stack([level.real, level.imag, height], axis=-1)
 
-    def _along(self, at: FloatArray) -> FloatArray:
-        return np.column_stack([np.interp(at, self._travelled, axis) for axis in self._route_m.T])
-
-    def _may_be_near(self, person: _Person, origins_m: FloatArray, reach_m: float) -> bool:
-        """Return whether any origin is within reach of the middle of the stretch, or of its ends.
-
-        Nobody on the stretch is farther from its middle than half its length.
-        """
-        middle = self._along(np.array([person.start_m + person.length_m / 2]))[0, :2]
-        low, high = origins_m[:, :2].min(axis=0), origins_m[:, :2].max(axis=0)
-        nearest = np.clip(middle, low, high)
-        return math.dist(middle, nearest) <= reach_m + person.length_m / 2 + BESIDE_M + RADIUS_M
+    def _level(self, at: FloatArray) -> npt.NDArray[np.complex128]:
+        """Return points of the route as x + i y (turning one to the left is a product with i)."""
+        return np.asarray(np.interp(at, self._travelled, self._route), dtype=np.complex128)
 
 
 def _drawn(
@@ -143,37 +157,31 @@ def _drawn(
     return tuple(drawn)
 
 
-def _may_meet(fans: Fans, middles_m: FloatArray, reach_m: float) -> np.ndarray:
-    """Return which fans may have a ray that meets an upright cylinder, shape (M,).
+def _extents(directions: FloatArray) -> FloatArray:
+    """Return how far a person reaches from its middle along unit vectors, (..., 3) -> (...), m."""
+    level = np.hypot(directions[..., 0], directions[..., 1])
+    return np.asarray(RADIUS_M * level + HEIGHT_M / 2 * np.abs(directions[..., 2]))
 
-    A fan lies in a half-plane. It misses the cylinder if that lies beside the plane or behind the
-    origin altogether; the extent of a cylinder along any unit vector is known.
+
+def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Return the scalar products over the last axis: faster than a sum of so few."""
+    return np.asarray(a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2])
+
+
+def _cylinder_ranges(
+    ways: FloatArray, forward: FloatArray, up: FloatArray, elevations_rad: FloatArray
+) -> FloatArray:
+    """Return how far a person is along the rays of fans, shape (K, R), m; infinite: missed.
 
     Args:
-        fans: Rays.
-        middles_m: Middle of the cylinder when each fan is taken, shape (M, 3), m.
-        reach_m: Cylinders farther away may be left out.
+        ways: From the origins to the middle of the person, shape (K, 3), m.
+        forward: Unit vectors of elevation zero, shape (K, 3).
+        up: Unit vectors of elevation 90 degrees, shape (K, 3).
+        elevations_rad: Of the rays, shape (R,).
     """
-    ways = middles_m - fans.origins_m
-    normals = np.cross(fans.forward, fans.up)
-    beside = np.abs(np.sum(normals * ways, axis=1)) <= _extent(normals)
-    ahead = np.sum(fans.forward * ways, axis=1) >= -_extent(fans.forward)
-    near = np.sum(ways**2, axis=1) <= (reach_m + HEIGHT_M) ** 2
-    return np.asarray(beside & ahead & near)
-
-
-def _extent(directions: FloatArray) -> FloatArray:
-    """Return how far a person reaches from its middle along unit vectors, shape (M,), m."""
-    level = np.hypot(directions[:, 0], directions[:, 1])
-    return np.asarray(RADIUS_M * level + HEIGHT_M / 2 * np.abs(directions[:, 2]))
-
-
-def _cylinder_ranges(fans: Fans, chosen: np.ndarray, middles_m: FloatArray) -> FloatArray:
-    """Return how far an upright cylinder is along the rays of some fans, shape (K, R), m."""
-    level, rise = np.cos(fans.elevations_rad)[:, None], np.sin(fans.elevations_rad)[:, None]
-    rays = level * fans.forward[chosen, None] + rise * fans.up[chosen, None]
-    x, y, z = np.moveaxis(rays, -1, 0)
-    way_x, way_y, way_z = (middles_m - fans.origins_m[chosen]).T[..., None]
+    level, rise = np.cos(elevations_rad), np.sin(elevations_rad)
+    x, y, z = (forward[:, axis, None] * level + up[:, axis, None] * rise for axis in range(3))
+    way_x, way_y, way_z = ways.T[..., None]
     # Between the two points where the ray crosses the mantle, seen from above ...
     square = x**2 + y**2 + _TINY
     nearest = (x * way_x + y * way_y) / square

@@ -62,7 +62,7 @@ class Places:
 
     def _found(self, position_m: FloatArray) -> int:
         place = len(self._founded_m)
-        self._founded_m.append(position_m)
+        self._founded_m.append(position_m.copy())  # of a whole drive of poses, it may be a view
         self._cells.setdefault(self._cell(position_m), []).append(place)
         return place
 

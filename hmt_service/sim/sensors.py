@@ -12,6 +12,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 from pydantic import Field
 
 from hmt_service.core.geometry import FloatArray, Pose, identity, inverse, planar_pose, yaw_of
@@ -39,11 +40,26 @@ class _Pattern:
 
     @property
     def directions(self) -> FloatArray:
-        """Unit vectors in the sensor frame, column by column, shape (C R, 3)."""
+        """Unit vectors in the sensor frame, column by column, shape (3, C R)."""
         azimuth, elevation = np.meshgrid(self.azimuths, self.elevations, indexing="ij")
         level = np.cos(elevation)
         parts = [level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)]
-        return np.stack(parts, axis=-1).reshape(-1, 3)
+        return np.stack(parts).reshape(3, -1)
+
+    @property
+    def point_times(self) -> FloatArray | None:
+        """When each ray is taken, as a share of the sweep, shape (C R,); None: all at its end."""
+        return None if self.shares is None else self.shares.repeat(len(self.elevations))
+
+    def times_s(self, stamps_s: FloatArray, period_s: float) -> FloatArray:
+        """Return when each column is taken, shape (B, C); all at once: shape (B, 1).
+
+        Args:
+            stamps_s: Ends of the sweeps, shape (B,).
+            period_s: What a sweep takes.
+        """
+        shares = np.ones(1) if self.shares is None else self.shares
+        return stamps_s[:, None] + (shares - 1.0) * period_s
 
     def fans(self, world_from_body: FloatArray, sensor_in_body: FloatArray) -> Fans:
         """Return a fan per column of each sweep.
@@ -54,13 +70,9 @@ class _Pattern:
         """
         rotation = world_from_body[..., :3, :3]
         ahead, aside, up = np.moveaxis(rotation, -1, 0)
-        c, s = np.cos(self.azimuths)[:, None], np.sin(self.azimuths)[:, None]
-        forward = ahead * c + aside * s
         origins = rotation @ sensor_in_body + world_from_body[..., :3, 3]
-        origins, up = (np.broadcast_to(each, forward.shape) for each in (origins, up))
-        return Fans(
-            origins.reshape(-1, 3), forward.reshape(-1, 3), up.reshape(-1, 3), self.elevations
-        )
+        forward = ahead * np.cos(self.azimuths)[:, None] + aside * np.sin(self.azimuths)[:, None]
+        return Fans(origins, up, forward, self.elevations)
 
 
 class RangeSensor(Declared, ABC):
@@ -96,42 +108,37 @@ class RangeSensor(Declared, ABC):
         self,
         caster: RayCaster,
         crowd: Crowd,
-        motion: Motion,
-        stamps_s: FloatArray,
+        stretches: Iterable[tuple[FloatArray, Motion]],
         period_s: float,
         rng: np.random.Generator,
-    ) -> Iterator[Scan]:
-        """Yield one scan per stamp; rays without return are left out.
+    ) -> Iterator[tuple[StampedPose, Scan]]:
+        """Yield one scan per stamp and the true pose then; rays without return are left out.
 
         Args:
             caster: World that the robot moves in.
             crowd: People in it.
-            motion: True motion in the frame of the world.
-            stamps_s: Times of the scans, shape (B,): the ends of the sweeps.
+            stretches: Stamps of some scans, shape (B,), which are the ends of their sweeps, and the
+                true motion in the frame of the world meanwhile.
             period_s: Time between two scans, all of which a sweep takes.
             rng: Source of the range noise.
         """
         pattern = self._pattern()
-        times = stamps_s[:, None]
-        if pattern.shares is not None:
-            times = times + (pattern.shares - 1.0) * period_s
-        mount = np.array(self.sensor_in_body)
-        fans = pattern.fans(motion.at(times), mount)
-        per_fan = np.broadcast_to(times, (len(stamps_s), len(pattern.azimuths))).ravel()
-        ranges = np.minimum(caster.ranges(fans), crowd.ranges(fans, per_fan, self.reach_m))
-        noise = rng.normal(0.0, self.range_sigma_m, (len(stamps_s), self.rays))
-        yield from self._scans(stamps_s, ranges.reshape(noise.shape) + noise, pattern, mount)
-
-    def _scans(
-        self, stamps_s: FloatArray, ranges: FloatArray, pattern: _Pattern, mount: FloatArray
-    ) -> Iterator[Scan]:
-        directions, times = pattern.directions, None
-        if pattern.shares is not None:
-            times = pattern.shares.repeat(len(pattern.elevations))
-        for stamp_s, each in zip(stamps_s.tolist(), ranges, strict=True):
-            is_return = (each >= self.min_range_m) & (each <= self.max_range_m)
-            points = mount + directions[is_return] * each[is_return, None]
-            yield Scan(stamp_s, points, mount, None if times is None else times[is_return])
+        directions, mount = pattern.directions, np.array(self.sensor_in_body)
+        point_times = pattern.point_times
+        for stamps_s, motion in stretches:
+            times_s = pattern.times_s(stamps_s, period_s)
+            fans = pattern.fans(motion.at(times_s), mount)
+            ranges = caster.ranges(fans)
+            crowd.occlude(ranges, fans, times_s, self.reach_m)
+            ranges = ranges.reshape(len(stamps_s), -1)
+            noise = rng.normal(0.0, self.range_sigma_m, ranges.shape)
+            truths = map(StampedPose, stamps_s.tolist(), motion.at(stamps_s))
+            for truth, each in zip(truths, ranges + noise, strict=True):
+                is_return = (each >= self.min_range_m) & (each <= self.max_range_m)
+                (returns,) = np.nonzero(is_return)
+                points = _points(directions, mount, each, returns)
+                shares = None if point_times is None else point_times[returns]
+                yield truth, Scan(truth.stamp_s, points, mount, shares)
 
 
 @checked
@@ -221,47 +228,65 @@ class WheelOdometry(Declared):
     slip_sigma_rad: float = Field(default=0.0, ge=0.0)
     """Standard deviation of the heading error of one slip."""
 
-    def observe(
-        self, trajectory: Iterable[StampedPose], rng: np.random.Generator
-    ) -> Iterator[OdometryReading]:
-        """Yield one reading per pose, in a frame that starts at the first one.
 
-        The wheels know nothing of slopes: the readings are planar, and distances are along the
-        ground.
+class DeadReckoning:
+    """What the wheels add up to, in a frame that starts at the first pose.
+
+    The wheels know nothing of slopes: the readings are planar, and distances are along the ground.
+    """
+
+    def __init__(self, wheels: WheelOdometry, rng: np.random.Generator) -> None:
+        """Start before the first pose.
 
         Args:
-            trajectory: True poses.
+            wheels: Their errors.
             rng: Source of the noise.
         """
-        (slip_rng,) = rng.spawn(1)
-        poses = iter(trajectory)
-        before = next(poses, None)
-        if before is None:
-            return
-        odom_from_body = identity()
-        yield OdometryReading(before.stamp_s, odom_from_body)
-        for after in poses:
-            motion = inverse(before.reference_from_body) @ after.reference_from_body
-            odom_from_body = odom_from_body @ self._measured(motion, rng, slip_rng)
-            yield OdometryReading(after.stamp_s, odom_from_body)
-            before = after
+        self._wheels = wheels
+        self._rng = rng
+        (self._slip_rng,) = rng.spawn(1)
+        self._before: StampedPose | None = None
+        self._odom_from_body = identity()
 
-    def _measured(
-        self, motion: Pose, rng: np.random.Generator, slip_rng: np.random.Generator
-    ) -> Pose:
+    def reading(self, truth: StampedPose) -> OdometryReading:
+        """Return the reading at the next true pose."""
+        if self._before is not None:
+            motion = inverse(self._before.reference_from_body) @ truth.reference_from_body
+            self._odom_from_body = self._odom_from_body @ self._measured(motion)
+        self._before = truth
+        return OdometryReading(truth.stamp_s, self._odom_from_body)
+
+    def _measured(self, motion: Pose) -> Pose:
         """Return what the wheels make of a motion, planar, shape (4, 4)."""
+        wheels, rng = self._wheels, self._rng
         distance, turn = float(np.hypot(*motion[:2, 3])), yaw_of(motion)
-        x, y = rng.normal(self.scale * motion[:2, 3], self.sigma_m_per_sqrt_m * math.sqrt(distance))
+        x, y = rng.normal(
+            wheels.scale * motion[:2, 3], wheels.sigma_m_per_sqrt_m * math.sqrt(distance)
+        )
         yaw = rng.normal(
-            turn + self.drift_rad_per_m * distance,
+            turn + wheels.drift_rad_per_m * distance,
             math.hypot(
-                self.sigma_rad_per_sqrt_m * math.sqrt(distance),
-                self.sigma_rad_per_sqrt_rad * math.sqrt(abs(turn)),
+                wheels.sigma_rad_per_sqrt_m * math.sqrt(distance),
+                wheels.sigma_rad_per_sqrt_rad * math.sqrt(abs(turn)),
             ),
         )
-        slips = slip_rng.poisson(self.slips_per_m * distance)
+        slips = self._slip_rng.poisson(wheels.slips_per_m * distance)
         if slips:
             # The sum of exponential draws is a gamma one.
-            x += self.slip_m * slip_rng.gamma(slips)
-            yaw += self.slip_sigma_rad * math.sqrt(slips) * slip_rng.standard_normal()
+            x += wheels.slip_m * self._slip_rng.gamma(slips)
+            yaw += wheels.slip_sigma_rad * math.sqrt(slips) * self._slip_rng.standard_normal()
         return planar_pose(x, y, yaw)
+
+
+def _points(
+    directions: FloatArray, mount: FloatArray, ranges: FloatArray, returns: npt.NDArray[np.intp]
+) -> FloatArray:
+    """Return what some of the rays meet, in the body frame, shape (N, 3), m.
+
+    One axis after the other takes a fifth of the time.
+    """
+    points = np.empty((len(returns), 3))
+    met_at = ranges[returns]
+    for axis in range(3):
+        points[:, axis] = mount[axis] + directions[axis, returns] * met_at
+    return points

@@ -10,23 +10,25 @@ import math
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import islice, tee
+from itertools import islice
 
 import numpy as np
 from pydantic import Field
 
 from hmt_service.core.geometry import FloatArray, Pose
-from hmt_service.core.types import OdometryReading, Reading, Scan, StampedPose
+from hmt_service.core.types import Reading, Scan, StampedPose
 from hmt_service.sim.declared import Declared, checked
 from hmt_service.sim.people import Crowd
+from hmt_service.sim.places import RADIUS_M as PLACE_RADIUS_M
 from hmt_service.sim.places import Places
 from hmt_service.sim.raycasting import RayCaster
-from hmt_service.sim.sensors import Laser2d, Lidar3d, WheelOdometry
+from hmt_service.sim.sensors import DeadReckoning, Laser2d, Lidar3d, WheelOdometry
 from hmt_service.sim.trajectories import STEP_S, Motion, PathFollower
 from hmt_service.sim.worlds.world import World
 
-# Rays that are cast at once: enough to keep the threads busy, few enough to stay in small memory.
+# What is cast at once: enough to keep the threads busy, little enough to stay in small memory.
 _RAYS_AT_ONCE = 1 << 17
+_SCANS_AT_ONCE = 64
 
 
 @checked
@@ -53,14 +55,11 @@ SHORT_SIGHTED = Robot(
 )
 """For worlds whose places look alike: neither its laser nor its wheels tell them apart."""
 OUTDOOR_LASER = Robot(
-    follower=PathFollower(speed_m_s=1.2, turn_rad_s=1.5),
+    follower=PathFollower(speed_m_s=1.2, turn_rad_s=1.8),
     sensor=Laser2d(field_of_view_rad=math.pi, max_range_m=30.0),
 )
 """Walking pace, between buildings: 180 degrees, 361 beams, 30 m."""
-LIDAR = Robot(
-    follower=PathFollower(speed_m_s=1.5, turn_rad_s=1.5),
-    sensor=Lidar3d(),
-)
+LIDAR = Robot(follower=PathFollower(speed_m_s=1.5, turn_rad_s=2.5), sensor=Lidar3d())
 """Up and down ramps: 16 rows of 720 columns, 60 m."""
 
 
@@ -94,38 +93,26 @@ def simulate(world: World, robot: Robot, seed: int, *, people: int = 0) -> Itera
     range_rng, odometry_rng, drop_rng, crowd_rng = np.random.default_rng(seed).spawn(4)
     drive = robot.follower.drive(world.route_m)
     crowd = Crowd(world.route_m, people, crowd_rng)
-    caster = RayCaster(world)
-    scans, poses = tee(_scans(drive, robot, caster, crowd, range_rng))
-    wheels = robot.odometry.observe((truth for truth, _ in poses), odometry_rng)
+    caster = RayCaster(world, max(robot.sensor.reach_m, PLACE_RADIUS_M))
+    at_once = min(max(1, _RAYS_AT_ONCE // robot.sensor.rays), _SCANS_AT_ONCE)
+    stretches = _stretches(drive, robot.scan_period_s, at_once)
+    scans = robot.sensor.observe(caster, crowd, stretches, robot.scan_period_s, range_rng)
+    wheels = DeadReckoning(robot.odometry, odometry_rng)
     return _instants(scans, wheels, Places(caster), robot.drop_share, drop_rng)
 
 
 def _instants(
     scans: Iterator[tuple[StampedPose, Scan]],
-    wheels: Iterator[OdometryReading],
+    wheels: DeadReckoning,
     places: Places,
     drop_share: float,
     rng: np.random.Generator,
 ) -> Iterator[Instant]:
-    for (truth, scan), reading in zip(scans, wheels, strict=True):
+    for truth, scan in scans:
+        readings: tuple[Reading, ...] = (wheels.reading(truth), scan)
         is_lost = rng.random() < drop_share
         place = places.at(truth.reference_from_body[:3, 3])
-        yield Instant(truth, place, (reading,) if is_lost else (reading, scan))
-
-
-def _scans(
-    drive: Iterator[StampedPose],
-    robot: Robot,
-    caster: RayCaster,
-    crowd: Crowd,
-    rng: np.random.Generator,
-) -> Iterator[tuple[StampedPose, Scan]]:
-    """Yield each scan and the true pose at its stamp."""
-    at_once = max(1, _RAYS_AT_ONCE // robot.sensor.rays)
-    for stamps_s, motion in _stretches(drive, robot.scan_period_s, at_once):
-        scans = robot.sensor.observe(caster, crowd, motion, stamps_s, robot.scan_period_s, rng)
-        for stamp_s, pose, scan in zip(stamps_s.tolist(), motion.at(stamps_s), scans, strict=True):
-            yield StampedPose(stamp_s, pose), scan
+        yield Instant(truth, place, readings[:1] if is_lost else readings)
 
 
 def _stretches(
