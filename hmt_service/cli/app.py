@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from hmt_service import __version__
-from hmt_service.cli import control, demo, evaluate, query, replay, run, serve
+from hmt_service.cli import control, demo, evaluate, query, replay, run, serve, sim
 
 app = typer.Typer(
     name="hmt",
@@ -41,6 +41,7 @@ def _options(
 
 app.command("demo")(demo.demo)
 app.command("run")(run.run)
+app.command("sim")(sim.sim)
 app.command("serve")(serve.serve)
 app.command("replay")(replay.replay)
 app.command("status")(query.status)

@@ -28,7 +28,7 @@ def print_malformed(console: Console, log: Log) -> None:
     if not log.malformed:
         return
     total = sum(malformed.count for malformed in log.malformed)
-    console.print(f"[yellow]{total} malformed readings left out")
+    console.print(f"[yellow]malformed and left out: {total}")
     for malformed in log.malformed[:_SHOWN]:
         times = f", {malformed.count} times" if malformed.count > 1 else ""
         text = f"  {malformed.place}: {malformed.reason}{times}"

@@ -21,7 +21,7 @@ _COLUMNS = 8
 
 def write_tum(path: Path, trajectory: Iterable[StampedPose]) -> None:
     """Write a trajectory; equal poses give equal bytes."""
-    path.write_bytes("".join(map(_format, trajectory)).encode())
+    path.write_bytes("".join(map(tum_line, trajectory)).encode())
 
 
 def read_tum(path: Path) -> tuple[StampedPose, ...]:
@@ -34,7 +34,8 @@ def read_tum(path: Path) -> tuple[StampedPose, ...]:
     return tuple(_pose(place, row) for place, row in read_rows(path, columns=_COLUMNS))
 
 
-def _format(pose: StampedPose) -> str:
+def tum_line(pose: StampedPose) -> str:
+    """Return one line of such a file."""
     translation_m = pose.reference_from_body[:3, 3]
     values = np.concatenate([translation_m, quaternion_of(pose.reference_from_body)])
     # z: a zero has no sign.

@@ -17,8 +17,9 @@ from hmt_service.core.engine import Engine
 from hmt_service.core.odometry import Odometry
 from hmt_service.errors import NotFound, Unavailable
 from hmt_service.io.logs import read_log
+from hmt_service.io.mcap_log import McapWriter
 from hmt_service.io.trajectory import read_tum
-from tests.flat import SETTINGS, path, ranges_from
+from tests.flat import SETTINGS, path, ranges_from, readings
 from tests.service.harness import RunningDaemon, free_endpoint, running_daemon
 
 SCANS = 200
@@ -147,6 +148,22 @@ def test_replay_keeps_the_pace_that_it_is_told(tmp_path: Path) -> None:
         result = hmt(daemon, "replay", str(log), "--rate", str(rate))
         assert time.monotonic() - started_s >= (scans - 1) * PERIOD_S / rate
     assert f"{2 * scans} readings sent, refused none; {scans} scans new" in result.output
+
+
+def test_an_mcap_log_is_replayed_as_it_is_read(tmp_path: Path) -> None:
+    log = tmp_path / "flat.mcap"
+    with log.open("wb") as file:
+        writer = McapWriter(file)
+        for reading in readings(60):
+            writer.write(reading)
+        writer.finish()
+    log.write_bytes(log.read_bytes()[:-1000])
+    with running_daemon(tmp_path / "out") as daemon:
+        result = hmt(daemon, "replay", str(log))
+    assert "60 scans, 60 odometry readings" in result.output
+    assert "120 readings sent, refused none; 60 scans new" in result.output
+    assert "malformed and left out: 1" in result.output
+    assert "the file ends or cannot be read from here on" in result.output
 
 
 def test_a_command_without_daemon_says_where_it_looked() -> None:

@@ -62,7 +62,7 @@ def test_run_writes_a_pose_per_scan_near_the_truth(log: Path, tmp_path: Path) ->
 def test_run_reports_malformed_lines_by_number(log: Path, tmp_path: Path) -> None:
     result = run(log, tmp_path)
     assert f"{SCANS} scans, {SCANS} odometry readings" in result.stderr
-    assert "2 malformed readings" in result.stderr
+    assert "malformed and left out: 2" in result.stderr
     assert "line 11:" in result.stderr
     assert "line 12:" in result.stderr
 
