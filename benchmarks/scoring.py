@@ -14,11 +14,12 @@ Known area.
     visits that earlier decisions have wrongly added to an area do not change what it is.
 
 New area.
-    A keyframe *returns* when an earlier visit has a keyframe in the same true place at least
-    `AWAY_M` of path before it; a visit returns when at least half of its keyframes do. A new area
-    is a *missed loop* if the visit returns, and right if not. Sightings from visits to the area
-    that the topology says the robot has just left do not count: a border may fall in the middle of
-    a known place, or where the robot turns round, and the two areas are tied where they touch.
+    A keyframe *returns* when an earlier visit has a keyframe in the same true place, at most
+    `NEAR_M` away, and at least `AWAY_M` of path before. A visit returns when at least
+    `RETURN_SHARE` of its keyframes do. A new area is a *missed loop* if the visit returns, and
+    right if not. Keyframes that are as near to a visit to the area that the topology says the robot
+    has just left do not count: a border may fall in the middle of a known place, or where the robot
+    turns round, and the two areas are tied where they touch.
 
 A topology is right if all of its assignments are. One wrong assignment often makes those after it
 wrong too (the robot goes on along the wrong corridor); each of them counts.
@@ -31,7 +32,7 @@ of the visit (the same area at the same pose, within the tolerance, or a new are
 which is as right as its most probable hypothesis and as probable as all of them.
 
 Both a known area and a new one may be right: a visit that begins in the unknown and ends in a known
-place, or beside an area that is in sight, has no single true answer.
+place, or the other way round, has no single true answer.
 
 What this cannot see: a loop inside one visit or back into the area just left, and whether an area
 is of a sensible size. `placement` does not care where borders are: of the keyframes that return,
@@ -58,8 +59,13 @@ TOLERANCE_M = 1.5
 """Largest error of the position in a loop that is right."""
 TOLERANCE_RAD = math.radians(15.0)
 """Largest error of the attitude in a loop that is right."""
+NEAR_M = 2.0
+"""Farthest that two keyframes are apart where the robot has come back."""
 AWAY_M = 10.0
-"""Least path between two sightings of a place that make a return."""
+"""Least path between them."""
+RETURN_SHARE = 2.0 / 3.0
+"""Least share of the keyframes of a visit that has come back: if it is less, the visit is on the
+border of what is known."""
 
 
 class Verdict(StrEnum):
@@ -154,7 +160,7 @@ def judge_all(journey: Journey, topology: Topology) -> tuple[Verdict, ...]:
 
 def is_true_return(journey: Journey, visit: int) -> bool:
     """Return whether a map of nothing but new areas is wrong about a visit."""
-    return _returns(journey, visit, {visit - 1})
+    return _returns(journey, visit, range(max(visit - 1, 0), visit))
 
 
 def decide(journey: Journey, topologies: Sequence[Topology], visit: int) -> Decision:
@@ -202,31 +208,42 @@ def placement(journey: Journey, reference_from_keyframe: FloatArray) -> Placemen
     """
     world_from_keyframe = journey.world_from_keyframe
     returning = right = 0
-    for k, place in enumerate(journey.place):
-        is_away = journey.travelled_m[k] - journey.travelled_m[:k] >= AWAY_M
-        before = np.flatnonzero(is_away & (journey.place[:k] == place))
-        if not len(before):
+    for k in range(1, len(journey.place)):
+        apart_m, is_away = _sightings(journey, slice(k, k + 1))
+        apart_m = np.where(is_away, apart_m, np.inf)[0]
+        before = int(np.argmin(apart_m))
+        if apart_m[before] > NEAR_M:
             continue
-        apart = np.linalg.norm(
-            world_from_keyframe[before, :3, 3] - world_from_keyframe[k, :3, 3], axis=1
-        )
-        nearest = before[np.argmin(apart)]
         returning += 1
         right += _agree(
-            inverse(world_from_keyframe[nearest]) @ world_from_keyframe[k],
-            inverse(reference_from_keyframe[nearest]) @ reference_from_keyframe[k],
+            inverse(world_from_keyframe[before]) @ world_from_keyframe[k],
+            inverse(reference_from_keyframe[before]) @ reference_from_keyframe[k],
         )
     return Placement(returning, right)
 
 
 def _returns(journey: Journey, visit: int, just_left: Collection[int]) -> bool:
     own = journey.keyframes_of(visit)
-    before = np.zeros(len(journey.place), dtype=bool)
-    for earlier in range(visit):
-        before[journey.keyframes_of(earlier)] = earlier not in just_left
-    is_same = journey.place[own, None] == journey.place[before]
-    is_away = journey.travelled_m[own, None] - journey.travelled_m[before] >= AWAY_M
-    return bool((is_same & is_away).any(axis=1).mean() >= 0.5)
+    is_left = np.zeros(own.start, dtype=bool)
+    for earlier in just_left:
+        is_left[journey.keyframes_of(earlier)] = True
+    apart_m, is_away = _sightings(journey, own)
+    is_near = apart_m <= NEAR_M
+    is_back = (is_near & is_away).any(axis=1) & ~(is_near & is_left).any(axis=1)
+    return bool(is_back.mean() >= RETURN_SHARE)
+
+
+def _sightings(journey: Journey, own: slice) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
+    """Return how some keyframes relate to all before the first of them.
+
+    Returns:
+        Distances, infinite between different places, and whether enough path lies between.
+    """
+    position = journey.world_from_keyframe[:, :3, 3]
+    apart_m = np.linalg.norm(position[own, None] - position[: own.start], axis=2)
+    apart_m[journey.place[own, None] != journey.place[: own.start]] = np.inf
+    is_away = journey.travelled_m[own, None] - journey.travelled_m[: own.start] >= AWAY_M
+    return apart_m, is_away
 
 
 def _is_there(journey: Journey, topology: Topology, visit: int, area: int) -> bool:

@@ -170,11 +170,24 @@ def test_a_place_seen_less_than_ten_metres_ago_was_not_left() -> None:
     assert is_true_return(wider, 2)
 
 
-@pytest.mark.parametrize(("known", "is_return"), [(2, True), (1, False)])
-def test_half_of_the_keyframes_make_a_return(*, known: int, is_return: bool) -> None:
-    known_places, new_places = [0.5] * known, [100.5] * (4 - known)
+@pytest.mark.parametrize(("known", "is_return"), [(4, True), (3, False)])
+def test_two_thirds_of_the_keyframes_make_a_return(*, known: int, is_return: bool) -> None:
+    known_places, new_places = [0.5] * known, [100.5] * (6 - known)
     travelled = line([0.0, 1.0, 50.0, 51.0, *known_places, *new_places], [0, 2, 4])
     assert is_true_return(travelled, 2) is is_return
+
+
+def test_a_wall_or_two_metres_keep_places_apart() -> None:
+    """The robot comes back to 0 m, or 1.9 m or 2.1 m beside it, or behind a wall."""
+    for beside_m, place, is_return in (
+        (0.0, 0, True),
+        (1.9, 0, True),
+        (2.1, 0, False),
+        (0.5, 7, False),
+    ):
+        poses = [planar_pose(0.0, 0.0, 0.0), planar_pose(50.0, 0.0, 0.0)]
+        travelled = journey([*poses, planar_pose(0.0, beside_m, 0.0)], [0, 5, place], [0, 1, 2])
+        assert is_true_return(travelled, 2) is is_return
 
 
 def test_placement_asks_each_keyframe_that_returns_wherever_the_borders_are() -> None:
