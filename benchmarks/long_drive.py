@@ -24,14 +24,11 @@ from hmt_service.core.config import Config
 from hmt_service.core.engine import Engine
 from hmt_service.core.odometry import Odometry
 from hmt_service.core.types import EventKind, MapMethod, Reading
-from hmt_service.errors import HmtError
 from hmt_service.io.map_file import write_map
 
 _STOP_S = 5.0
-
-
-class DriveFailed(HmtError):
-    """The process that maps has ended badly."""
+_LONGEST = 160
+"""Characters of an error that are told."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +72,9 @@ class End:
     elapsed_s: float
     """Time since the first reading, with everything, by the clock on the wall."""
     is_complete: bool
-    """Whether the readings came to an end; otherwise the time did."""
+    """Whether all readings were mapped."""
+    failure: str | None = None
+    """What went wrong, if something did."""
 
 
 def drive(
@@ -83,26 +82,27 @@ def drive(
 ) -> Generator[Entry | Checkpoint | End, None, None]:
     """Map readings in a process of its own until they, or the time, come to an end.
 
+    What goes wrong there is told at the end: how far a map can grow is a result.
+
     Args:
         readings: In the order of time; taken as they are needed.
         config: Settings of all stages.
         checkpoints: Numbers of areas at which the map is looked at, ascending.
         budget_s: Time since the first reading, by the clock on the wall, after which none is used.
-
-    Raises:
-        DriveFailed: If the process ends badly.
     """
     context = get_context("spawn")
     here, there = context.Pipe()
     arguments = (there, config, tuple(checkpoints), budget_s)
     process = context.Process(target=_map, args=arguments, daemon=True)
+    started_s = time.perf_counter()
     process.start()
     there.close()
     try:
         yield from _exchange(here, readings)
-    except (EOFError, OSError) as error:
+    except (EOFError, OSError):
         process.join(_STOP_S)
-        raise DriveFailed(f"the mapping process ended with code {process.exitcode}") from error
+        failure = f"the mapping process ended with code {process.exitcode}"
+        yield End(time.perf_counter() - started_s, False, failure)
     finally:
         here.close()
         process.join(_STOP_S)
@@ -132,39 +132,50 @@ def _map(
 ) -> None:
     """Map what comes through the pipe, and say what it takes; runs in a process of its own."""
     with suppress(EOFError, BrokenPipeError):  # nobody is interested any more
-        is_complete, elapsed_s = _map_until(connection, config, checkpoints, budget_s)
-        connection.send(End(elapsed_s, is_complete))
+        reading = connection.recv()
+        started_s = time.perf_counter()
+        grown = _Grown(config, checkpoints)
+        is_complete, failure = False, None
+        try:
+            while reading is not None and time.perf_counter() - started_s < budget_s:
+                for message in grown.by(reading):
+                    connection.send(message)
+                reading = connection.recv()
+            is_complete = reading is None
+        except Exception as error:  # noqa: BLE001 - how far a map can grow is what is asked
+            failure = f"{type(error).__name__}: {' '.join(str(error).split())[:_LONGEST]}"
+        connection.send(End(time.perf_counter() - started_s, is_complete, failure))
         while True:  # whoever is about to send more must not wait for ever
             connection.recv_bytes()
 
 
-def _map_until(
-    connection: Connection, config: Config, checkpoints: Sequence[int], budget_s: float
-) -> tuple[bool, float]:
-    """Return whether all readings were mapped, and how long that took."""
-    odometry, engine = Odometry(config), Engine(config)
-    memory_before = _memory_bytes()
-    awaited = list(checkpoints)
-    areas: set[float] = set()
-    scans, scans_s = 0, 0.0
-    reading = connection.recv()
-    started_s = time.perf_counter()
-    while reading is not None and time.perf_counter() - started_s < budget_s:
-        scan_started_s = time.process_time()
-        tracking = odometry.process(reading)
-        events = () if tracking is None else engine.process(tracking)
-        scan_s = time.process_time() - scan_started_s
+class _Grown:
+    """A map as it grows, and what that has taken."""
+
+    def __init__(self, config: Config, checkpoints: Sequence[int]) -> None:
+        self._odometry, self._engine = Odometry(config), Engine(config)
+        self._memory_before = _memory_bytes()
+        self._awaited = list(checkpoints)
+        self._areas: set[float] = set()
+        self._scans, self._scans_s = 0, 0.0
+
+    def by(self, reading: Reading) -> Iterator[Entry | Checkpoint]:
+        """Map one reading, and yield what there is to say."""
+        started_s = time.process_time()
+        tracking = self._odometry.process(reading)
+        if tracking is None:
+            return
+        events = self._engine.process(tracking)
+        scan_s = time.process_time() - started_s
         entered = [e.numbers["area"] for e in events if e.kind is EventKind.AREA_ENTERED]
-        if entered:
-            areas.update(entered)
-            connection.send(Entry(len(areas), scan_s, scans, scans_s))
-            scans, scans_s = 0, 0.0
-            if awaited and len(areas) >= awaited[0]:
-                connection.send(_look_at(engine, awaited.pop(0), memory_before))
-        elif tracking is not None:
-            scans, scans_s = scans + 1, scans_s + scan_s
-        reading = connection.recv()
-    return reading is None, time.perf_counter() - started_s
+        if not entered:
+            self._scans, self._scans_s = self._scans + 1, self._scans_s + scan_s
+            return
+        self._areas.update(entered)
+        yield Entry(len(self._areas), scan_s, self._scans, self._scans_s)
+        self._scans, self._scans_s = 0, 0.0
+        if self._awaited and len(self._areas) >= self._awaited[0]:
+            yield _look_at(self._engine, self._awaited.pop(0), self._memory_before)
 
 
 def _look_at(engine: Engine, areas: int, memory_before: int) -> Checkpoint:

@@ -131,12 +131,14 @@ def report(result: Result, budget_s: float, figure: Path) -> Report:
     largest = entries[-1].areas if entries else 0
     if not looks:
         raise InvalidInput(
-            f"{largest} areas in {end.elapsed_s:.1f} s: {CHECKPOINTS[0]} are the least to look at"
+            f"{largest} areas in {end.elapsed_s:.1f} s: {CHECKPOINTS[0]} are the least to look at; "
+            f"failure: {end.failure}"
         )
     stretches = stretches_of(entries, CHECKPOINTS)
     _draw(stretches, looks, figure)
     metrics = (
         Metric("largest", float(largest), "1", _HIGHER, None),
+        Metric("failures", float(end.failure is not None), "1", _LOWER, 0.0),
         *_point_metrics(stretches, looks),
         # How far a stretch that was cut off came depends on the machine.
         *_growth_metrics(stretches[: len(looks)], looks),
@@ -276,15 +278,17 @@ def _not_reached(
     largest: int, stretches: Sequence[Stretch], end: End, budget_s: float
 ) -> Iterator[str]:
     """Yield why each of the other checkpoints is missing, and how long it would have taken."""
-    for areas in CHECKPOINTS:
-        if areas <= largest:
-            continue
-        if end.is_complete:
-            yield f"{areas} areas: {largest} on the whole route"
-            continue
+    for areas in (areas for areas in CHECKPOINTS if areas > largest):
         more_s = projected_s(stretches, largest, areas)
-        rest = "" if more_s is None else f"; extrapolated {_duration(end.elapsed_s + more_s)}"
-        yield f"{areas} areas: {largest} in {_duration(budget_s)}{rest}"
+        if end.failure is not None:
+            why = f", then {end.failure}"
+        elif end.is_complete:
+            why = " on the whole route"
+        elif more_s is None:
+            why = f" in {_duration(budget_s)}"
+        else:
+            why = f" in {_duration(budget_s)}; extrapolated {_duration(end.elapsed_s + more_s)}"
+        yield f"{areas} areas: {largest}{why}"
 
 
 def _duration(seconds: float) -> str:

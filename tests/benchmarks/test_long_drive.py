@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import numpy as np
 import psutil
-import pytest
 
-from benchmarks.long_drive import Checkpoint, DriveFailed, End, Entry, drive
+from benchmarks.long_drive import Checkpoint, End, Entry, drive
 from hmt_service.core.config import load_config
-from hmt_service.core.types import Reading
+from hmt_service.core.types import Reading, Scan
 from tests import flat
 
 CONFIG = load_config(text=flat.SETTINGS)
@@ -70,11 +70,25 @@ def test_a_drive_that_nobody_follows_to_its_end_leaves_no_process_behind() -> No
     assert not process.is_running()
 
 
-def test_a_process_that_dies_is_an_error_with_its_exit_code() -> None:
+def test_a_process_that_dies_is_told_with_its_exit_code() -> None:
     before = mapping_processes()
     messages = drive(endless(), CONFIG, checkpoints=(), budget_s=600.0)
     next(messages)
     (process,) = set(mapping_processes()) - set(before)
     process.kill()
-    with pytest.raises(DriveFailed, match="-9"):
-        list(messages)
+    *_, end = messages
+    assert isinstance(end, End)
+    assert not end.is_complete
+    assert end.failure == "the mapping process ended with code -9"
+
+
+def test_an_engine_that_fails_is_told_after_what_it_has_done() -> None:
+    first, *others = flat.readings(20)
+    # No engine can map a scan of points that have only two coordinates.
+    broken = Scan(others[-1].stamp_s + 0.1, np.zeros((100, 2)), np.zeros(3))
+    *said, end = drive([first, *others, broken], CONFIG, checkpoints=(1,), budget_s=600.0)
+    assert isinstance(end, End)
+    assert not end.is_complete
+    assert end.failure is not None
+    assert "Error: " in end.failure
+    assert [type(message) for message in said] == [Entry, Checkpoint]

@@ -42,11 +42,17 @@ def stretch(areas: int, entry_s: float) -> Stretch:
     return Stretch(areas, float(areas), SCAN_S, entry_s, SCANS)
 
 
-def driven(entries: Sequence[Entry], looks: Sequence[int], *, is_complete: bool = False) -> Result:
+def driven(
+    entries: Sequence[Entry],
+    looks: Sequence[int],
+    *,
+    is_complete: bool = False,
+    failure: str | None = None,
+) -> Result:
     return {
         "entries": [asdict(each) for each in entries],
         "checkpoints": [asdict(look(areas)) for areas in looks],
-        "end": asdict(End(20.0, is_complete)),
+        "end": asdict(End(20.0, is_complete, failure)),
     }
 
 
@@ -192,6 +198,18 @@ def test_a_route_that_is_too_short_is_told_as_such(tmp_path: Path) -> None:
     entries = [entry(areas) for areas in range(1, 51)]
     found = report(driven(entries, [10, 30], is_complete=True), 20.0, tmp_path / "figure.png")
     assert found.skipped[0] == "100 areas: 50 on the whole route"
+
+
+def test_a_map_that_failed_keeps_what_was_measured_and_the_gate_sees_it(tmp_path: Path) -> None:
+    entries = [entry(areas) for areas in range(1, 51)]
+    failed, well = (
+        report(driven(entries, [10, 30], failure=failure), 20.0, tmp_path / "figure.png")
+        for failure in ("ValueError: singular", None)
+    )
+    assert failed.skipped[0] == "100 areas: 50, then ValueError: singular"
+    (failures,) = set(failed.metrics) - set(well.metrics)
+    assert (failures.key, failures.value, failures.rel_tol) == ("failures", 1.0, 0.0)
+    assert len(failed.metrics) == len(well.metrics)
 
 
 @pytest.mark.parametrize("areas", [0, 5])
