@@ -205,10 +205,12 @@ def _individual(pitch: float, is_doubly_lined: bool, rng: np.random.Generator) -
     room = _furnished(pitch, rng.uniform(-0.9, 0.9), rng.uniform(3.9, _DEPTH_M), rng)
     length, depth = rng.uniform(0.5, 1.2), rng.uniform(0.15, 0.4)
     if is_doubly_lined:
-        # Beside its own door, on the wider side.
+        # On its own wall, on the wider side of the door.
         x = -pitch / 2 if room.door_x > 0.0 else pitch / 2 - length
         cabinet = Box(x, -depth, x + length, 0.0, 1.2)
     else:
-        x = rng.uniform(-pitch / 2, pitch / 2 - length)
+        # On the opposite wall, which ends sooner at the corners of the ring.
+        free = (pitch - _CORRIDOR_M) / 2
+        x = rng.uniform(-free, free - length)
         cabinet = Box(x, -_CORRIDOR_M, x + length, depth - _CORRIDOR_M, 1.2)
     return _Room(room.door_x, room.free, [*room.standing, cabinet])

@@ -43,7 +43,7 @@ _INDOORS: tuple[tuple[_Path, ...], ...] = (
 """Paths that lead through a hall; the seed decides which."""
 _HALL = 0.55, 15.6
 """Share of its path that is in the hall, and width of the hall, m."""
-_MARGIN_M = 35.0
+_MARGIN_M = 45.0
 """From the outermost nodes to the edge of the world."""
 _PATH_M = 3.0
 """Width of a path; nothing stands on it."""
@@ -61,6 +61,12 @@ class _Lining:
     """From the edge of the path."""
 
 
+def _building(rng: np.random.Generator) -> Thing:
+    length, width = rng.uniform((14.0, 9.0), (36.0, 18.0))
+    return building(length, width, rng)
+
+
+_FRONTS = _Lining(_building, (4.0, 25.0), (2.5, 9.0))
 _LAMPS = _Lining(lamp, (20.0, 26.0), (0.2, 0.4))
 _LININGS = (
     _Lining(tree, (5.0, 10.0), (0.5, 2.5)),
@@ -68,15 +74,13 @@ _LININGS = (
     _Lining(hedge, (1.0, 8.0), (0.3, 2.0)),
     _Lining(car, (0.6, 6.0), (0.5, 1.0)),
 )
-_BUILDINGS = ((20, (24.0, 42.0), (14.0, 24.0)), (24, (10.0, 20.0), (8.0, 14.0)))
-"""How many are tried, and ranges of length and width, m."""
-_TRIES = 20
+_SCATTERED = ((_building, 40), (tree, 160))
+"""What stands anywhere, and how many are tried."""
 _PARKING_LOTS = 6
-_SCATTERED_TREES = 160
 
 
 def campus(seed: int, relief_m: float = 1.5) -> World:
-    """Draw a campus of 320 m x 240 m with seventeen paths, three of them through halls.
+    """Draw a campus of 340 m x 260 m with seventeen paths, three of them through halls.
 
     The route of 1.8 km to 2.2 km closes a long loop first, then shorter ones beside and inside
     it, and drives a third of its way on paths that it has driven before.
@@ -100,11 +104,20 @@ def campus(seed: int, relief_m: float = 1.5) -> World:
     legs = [leg for path in paths.values() for leg in pairwise(path)]
     for start, end in legs:
         site.take(_along(start, end, 1.0, _PATH_M))
-    _build(site, rng)
     for start, end in legs:
-        _line(site, start, end, rng)
-    for _ in range(_SCATTERED_TREES):
-        _plant(site, rng)
+        for side in (-1.0, 1.0):
+            _line(site, _along(start, end, 1.0, _PATH_M), side, _FRONTS, rng)
+    for _ in range(_PARKING_LOTS):
+        _park(site, rng)
+    for start, end in legs:
+        path = _along(start, end, 1.0, _PATH_M)
+        _line(site, path, rng.choice((-1.0, 1.0)), _LAMPS, rng)
+        for side in (-1.0, 1.0):
+            _line(site, path, side, _LININGS[rng.integers(len(_LININGS))], rng)
+    for thing, count in _SCATTERED:
+        for _ in range(count):
+            mesh, length, width = thing(rng)
+            site.add(mesh, site.somewhere(length, width, rng))
     mesh = joined(site.meshes)
     return World(f"campus-{seed}", mesh.vertices, mesh.triangles, _route(paths, terrain))
 
@@ -133,45 +146,31 @@ def _bent(
     return [start, end] if is_straight else [start, (start + end) / 2 + bend, end]
 
 
-def _build(site: Site, rng: np.random.Generator) -> None:
-    """Draw buildings, the large ones first, then parking lots."""
-    for count, lengths, widths in _BUILDINGS:
-        for _ in range(count):
-            length, width = rng.uniform(*lengths), rng.uniform(*widths)
-            thing = building(length, width, rng)
-            for _ in range(_TRIES):
-                if site.add(thing.mesh, site.somewhere(length, width, rng)):
-                    break
-    for _ in range(_PARKING_LOTS):
-        lot = site.somewhere(24.0, 16.0, rng)
-        for x in np.arange(-10.4, 10.5, 2.6):
-            for y in (-5.5, 5.5):
-                if rng.random() < 0.7:
-                    thing = car(rng)
-                    x_car, y_car = lot.to_world(np.array([x, y]) + rng.uniform(-0.2, 0.2, 2))
-                    yaw = lot.yaw_rad + math.pi / 2
-                    site.add(thing.mesh, Footprint(x_car, y_car, thing.length, thing.width, yaw))
+def _line(
+    site: Site, path: Footprint, side: float, lining: _Lining, rng: np.random.Generator
+) -> None:
+    """Draw a row on the left of a straight path, where `side` is 1, or on its right, where -1."""
+    x = rng.uniform(0.0, 8.0) - path.length / 2
+    while x < path.length / 2:
+        mesh, length, width = lining.thing(rng)
+        y = side * ((path.width + width) / 2 + rng.uniform(*lining.offset_m))
+        middle_x, middle_y = path.to_world(np.array([x + length / 2, y])).tolist()
+        place = Footprint(middle_x, middle_y, length, width, path.yaw_rad)
+        is_there = site.add(mesh, place)
+        x += (length if is_there else 0.0) + rng.uniform(*lining.gap_m)
 
 
-def _line(site: Site, start: FloatArray, end: FloatArray, rng: np.random.Generator) -> None:
-    """Draw rows of things on both sides of a straight piece of path, and lamps on one."""
-    path = _along(start, end, 1.0, _PATH_M)
-    sides = [(side, _LININGS[rng.integers(len(_LININGS))]) for side in (-1.0, 1.0)]
-    for side, lining in ((rng.choice((-1.0, 1.0)), _LAMPS), *sides):
-        x = rng.uniform(0.0, 8.0) - path.length / 2
-        while x < path.length / 2:
-            thing = lining.thing(rng)
-            y = side * (_PATH_M / 2 + rng.uniform(*lining.offset_m) + thing.width / 2)
-            x_thing, y_thing = path.to_world(np.array([x + thing.length / 2, y]))
-            place = Footprint(x_thing, y_thing, thing.length, thing.width, path.yaw_rad)
-            site.add(thing.mesh, place)
-            x += thing.length + rng.uniform(*lining.gap_m)
-
-
-def _plant(site: Site, rng: np.random.Generator) -> None:
-    """Draw a tree anywhere."""
-    thing = tree(rng)
-    site.add(thing.mesh, site.somewhere(thing.length, thing.width, rng))
+def _park(site: Site, rng: np.random.Generator) -> None:
+    """Draw a parking lot with two rows of spaces."""
+    lot = site.somewhere(24.0, 16.0, rng)
+    for x in np.arange(-10.4, 10.5, 2.6).tolist():
+        for y in (-5.5, 5.5):
+            mesh, length, width = car(rng)
+            shift = rng.uniform(-0.2, 0.2, 2)
+            if rng.random() < 0.7:
+                car_x, car_y = lot.to_world(np.array([x, y]) + shift).tolist()
+                yaw = lot.yaw_rad + math.pi / 2
+                site.add(mesh, Footprint(car_x, car_y, length, width, yaw))
 
 
 def _route(paths: Mapping[_Path, list[FloatArray]], terrain: Terrain) -> FloatArray:

@@ -15,6 +15,8 @@ from hmt_service.sim.worlds.plan import WALL_M, Box, furniture
 _DOOR_M = 1.1
 _GAP_M = 0.4
 """Least distance between what stands or opens along the same wall."""
+_END_M = 1.0
+"""Least distance from the end of a corridor to the middle of what stands or opens there."""
 
 _Lining = tuple[list[Box], list[Box]]
 """What opens into a wall, and what stands there; the wall is y = 0, the corridor below it."""
@@ -54,8 +56,8 @@ def _spots(
     for corridor in corridors:
         size_x, size_y = corridor.x_max - corridor.x_min, corridor.y_max - corridor.y_min
         for side in range(2):
-            along = rng.uniform(1.0, 6.0)
-            while along < max(size_x, size_y):
+            along = rng.uniform(_END_M, 6.0)
+            while along < max(size_x, size_y) - _END_M:
                 if size_x > size_y:
                     y = corridor.y_min if side else corridor.y_max
                     yield corridor, corridor.x_min + along, y, 2 * side

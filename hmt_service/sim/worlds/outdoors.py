@@ -97,9 +97,15 @@ def _standing(length: float, width: float, height: float) -> Box:
 
 def _prism(sides: int, radius: float, low: float, high: float) -> Mesh:
     """Return an upright prism around the origin."""
+    unit = _UNIT_PRISMS[sides]
+    vertices = unit.vertices * (radius, radius, high - low) + (0.0, 0.0, low)
+    return Mesh(vertices.astype(np.float32), unit.triangles)
+
+
+def _unit_prism(sides: int) -> Mesh:
+    """Return a prism of radius 1 and height 1 that stands on the origin."""
     angles = math.tau / sides * np.arange(sides)
-    ring = radius * np.column_stack([np.cos(angles), np.sin(angles)])
-    vertices = [np.column_stack([ring, np.full(sides, z)]) for z in (low, high)]
+    ring = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(sides)])
     here, after = np.arange(sides), (np.arange(sides) + 1) % sides
     fan = np.column_stack([np.zeros(sides - 2, dtype=np.int64), here[1:-1], here[2:]])
     triangles = [
@@ -108,6 +114,8 @@ def _prism(sides: int, radius: float, low: float, high: float) -> Mesh:
         fan[:, ::-1],
         fan + sides,
     ]
-    return Mesh(
-        np.concatenate(vertices).astype(np.float32), np.concatenate(triangles).astype(np.uint32)
-    )
+    vertices = np.concatenate([ring, ring + (0.0, 0.0, 1.0)])
+    return Mesh(vertices.astype(np.float32), np.concatenate(triangles).astype(np.uint32))
+
+
+_UNIT_PRISMS = {sides: _unit_prism(sides) for sides in (6, 8)}

@@ -143,8 +143,10 @@ def furniture(
             length, depth = rng.uniform(0.5, 1.8), rng.uniform(0.35, 0.8)
             side = rng.integers(5)
             size_x, size_y = (length, depth) if side % 2 == 0 else (depth, length)
-            x = rng.uniform(room.x_min, max(room.x_min, room.x_max - size_x))
-            y = rng.uniform(room.y_min, max(room.y_min, room.y_max - size_y))
+            size_x = min(size_x, room.x_max - room.x_min)
+            size_y = min(size_y, room.y_max - room.y_min)
+            x = rng.uniform(room.x_min, room.x_max - size_x)
+            y = rng.uniform(room.y_min, room.y_max - size_y)
             if side < 2:
                 x, y = (x, room.y_min) if side == 0 else (room.x_min, y)
             elif side < 4:

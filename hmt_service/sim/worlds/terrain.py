@@ -141,12 +141,12 @@ class Site:
         return Footprint(x, y, length, width, yaw)
 
     def _cells(self, place: Footprint) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-        """Return the cells under a footprint."""
+        """Return the cells under a footprint, which lies inside the area."""
         along, across = (
-            np.linspace(-size / 2, size / 2, 2 + math.ceil(size / (0.7 * _RASTER_M)))
+            size * np.linspace(-0.5, 0.5, 2 + math.ceil(size / (0.7 * _RASTER_M)))
             for size in (place.length, place.width)
         )
-        points = place.to_world(np.stack(np.meshgrid(along, across), axis=-1).reshape(-1, 2))
-        cells = np.floor((points - (self.area.x_min, self.area.y_min)) / _RASTER_M)
-        cells = np.clip(cells, 0, np.array(self._is_taken.shape) - 1).astype(np.int64)
-        return cells[:, 0], cells[:, 1]
+        cos, sin = math.cos(place.yaw_rad), math.sin(place.yaw_rad)
+        x = np.add.outer(cos * along, place.x - self.area.x_min - sin * across)
+        y = np.add.outer(sin * along, place.y - self.area.y_min + cos * across)
+        return (x / _RASTER_M).astype(np.int64), (y / _RASTER_M).astype(np.int64)

@@ -3,7 +3,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from hmt_service.sim.raycasting import RayCaster
 from hmt_service.sim.worlds.office import office
+from hmt_service.sim.worlds.world import World
+from tests.sim.worlds import beams
 
 
 def test_same_seed_draws_the_same_world() -> None:
@@ -48,3 +51,16 @@ def test_faces_look_outwards() -> None:
     centres = world.vertices.reshape(-1, 8, 3).mean(axis=1).repeat(12, axis=0)
     outwards = np.einsum("ij,ij->i", np.cross(b - a, c - a), a - centres)
     assert np.all(outwards > 0.0)
+
+
+def test_floor_and_ceiling_change_no_horizontal_beam() -> None:
+    world = office(0)
+    slabs = 2 * 12
+    bare = World(world.name, world.vertices, world.triangles[:-slabs], world.route_m)
+    eyes = world.route_m + (0.0, 0.0, 0.3)
+    with_slabs, without = (
+        beams.ranges(RayCaster(each), eyes, beams.level(180)) for each in (world, bare)
+    )
+    assert np.array_equal(with_slabs, without)
+    down = np.array([[0.0, 0.0, -1.0]])
+    assert np.all(np.isinf(beams.ranges(RayCaster(bare), eyes, down)))
