@@ -8,7 +8,7 @@ import pytest
 
 from benchmarks.clients import paced, stamp_of
 from hmt_service.core.types import Event, EventKind
-from hmt_service.errors import InvalidInput, Unavailable
+from hmt_service.errors import DeadlineExceeded, InvalidInput, Unavailable
 from hmt_service.service.codec import encode
 
 
@@ -57,6 +57,17 @@ def test_sleeping_too_long_is_not_counted() -> None:
 def test_questions_without_an_answer_do_not_count() -> None:
     latencies_s = ask(Clock(), iter([-0.1, 0.2, -0.1]), for_s=3.0)
     assert latencies_s == pytest.approx([0.2])
+
+
+def test_a_question_that_is_never_answered_counts_as_long_as_it_was_waited_for() -> None:
+    clock = Clock()
+
+    def call() -> None:
+        clock.now_s += 0.5
+        raise DeadlineExceeded("no answer in 0.5 s")
+
+    latencies_s = paced(call, period_s=1.0, for_s=2.0, now=clock.now, sleep=clock.sleep)
+    assert latencies_s == pytest.approx([0.5, 0.5])
 
 
 def test_something_else_published_as_a_pose_is_refused() -> None:
