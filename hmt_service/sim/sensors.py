@@ -40,11 +40,11 @@ class _Pattern:
 
     @property
     def directions(self) -> FloatArray:
-        """Unit vectors in the sensor frame, column by column, shape (3, C R)."""
+        """Unit vectors in the sensor frame, column by column, shape (C R, 3)."""
         azimuth, elevation = np.meshgrid(self.azimuths, self.elevations, indexing="ij")
         level = np.cos(elevation)
         parts = [level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)]
-        return np.stack(parts).reshape(3, -1)
+        return np.stack(parts, axis=-1).reshape(-1, 3)
 
     @property
     def point_times(self) -> FloatArray | None:
@@ -130,10 +130,11 @@ class RangeSensor(Declared, ABC):
             fans = pattern.fans(motion.at(times_s), mount)
             ranges = caster.ranges(fans)
             crowd.occlude(ranges, fans, times_s, self.reach_m)
-            ranges = ranges.reshape(len(stamps_s), -1)
-            noise = rng.normal(0.0, self.range_sigma_m, ranges.shape)
+            noisy = rng.standard_normal((len(stamps_s), self.rays))
+            noisy *= self.range_sigma_m
+            noisy += ranges.reshape(noisy.shape)
             truths = map(StampedPose, stamps_s.tolist(), motion.at(stamps_s))
-            for truth, each in zip(truths, ranges + noise, strict=True):
+            for truth, each in zip(truths, noisy, strict=True):
                 is_return = (each >= self.min_range_m) & (each <= self.max_range_m)
                 (returns,) = np.nonzero(is_return)
                 points = _points(directions, mount, each, returns)
@@ -285,8 +286,10 @@ def _points(
 
     One axis after the other takes a fifth of the time.
     """
-    points = np.empty((len(returns), 3))
-    met_at = ranges[returns]
+    points = directions.take(returns, axis=0)
+    met_at = ranges.take(returns)
     for axis in range(3):
-        points[:, axis] = mount[axis] + directions[axis, returns] * met_at
+        along = points[:, axis]
+        along *= met_at
+        along += mount[axis]
     return points
