@@ -9,18 +9,6 @@ from hmt_service.sim.worlds.world import World
 from tests.sim.worlds import beams
 
 
-def test_same_seed_draws_the_same_world() -> None:
-    first, second = office(5), office(5)
-    assert first.name == second.name
-    assert first.vertices.tobytes() == second.vertices.tobytes()
-    assert first.triangles.tobytes() == second.triangles.tobytes()
-    assert first.route_m.tobytes() == second.route_m.tobytes()
-
-
-def test_other_seed_draws_another_world() -> None:
-    assert office(5).vertices.tobytes() != office(6).vertices.tobytes()
-
-
 @pytest.mark.parametrize("seed", range(40))
 def test_route_is_long_and_keeps_inside_the_building(seed: int) -> None:
     world = office(seed)
