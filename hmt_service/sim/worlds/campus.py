@@ -7,7 +7,7 @@ References:
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -83,7 +83,7 @@ def campus(seed: int, relief_m: float = 1.5) -> World:
     """Draw a campus of 340 m x 260 m with seventeen paths, three of them through halls.
 
     The route of 1.8 km to 2.2 km closes a long loop first, then shorter ones beside and inside
-    it, and drives a third of its way on paths that it has driven before.
+    it, and drives nearly a third of its way on paths that it has driven before.
 
     Args:
         seed: The same seed gives the same world.
@@ -101,23 +101,9 @@ def campus(seed: int, relief_m: float = 1.5) -> World:
     for place in halls.values():
         site.add(hall(place.length, place.width, rng).mesh, place)
     paths = {path: _bent(nodes, path, path in halls, rng) for path in _PATHS}
-    legs = [leg for path in paths.values() for leg in pairwise(path)]
-    for start, end in legs:
-        site.take(_along(start, end, 1.0, _PATH_M))
-    for start, end in legs:
-        for side in (-1.0, 1.0):
-            _line(site, _along(start, end, 1.0, _PATH_M), side, _FRONTS, rng)
-    for _ in range(_PARKING_LOTS):
-        _park(site, rng)
-    for start, end in legs:
-        path = _along(start, end, 1.0, _PATH_M)
-        _line(site, path, rng.choice((-1.0, 1.0)), _LAMPS, rng)
-        for side in (-1.0, 1.0):
-            _line(site, path, side, _LININGS[rng.integers(len(_LININGS))], rng)
-    for thing, count in _SCATTERED:
-        for _ in range(count):
-            mesh, length, width = thing(rng)
-            site.add(mesh, site.somewhere(length, width, rng))
+    _fill(
+        site, [_along(*leg, 1.0, _PATH_M) for path in paths.values() for leg in pairwise(path)], rng
+    )
     mesh = joined(site.meshes)
     return World(f"campus-{seed}", mesh.vertices, mesh.triangles, _route(paths, terrain))
 
@@ -144,6 +130,25 @@ def _bent(
     start, end = nodes[path[0]], nodes[path[1]]
     bend = rng.uniform(-_BEND_M, _BEND_M, 2)
     return [start, end] if is_straight else [start, (start + end) / 2 + bend, end]
+
+
+def _fill(site: Site, paths: Sequence[Footprint], rng: np.random.Generator) -> None:
+    """Draw what stands along paths, the large things first, then what stands anywhere."""
+    for path in paths:
+        site.take(path)
+    for path in paths:
+        for side in (-1.0, 1.0):
+            _line(site, path, side, _FRONTS, rng)
+    for _ in range(_PARKING_LOTS):
+        _park(site, rng)
+    for path in paths:
+        _line(site, path, rng.choice((-1.0, 1.0)), _LAMPS, rng)
+        for side in (-1.0, 1.0):
+            _line(site, path, side, _LININGS[rng.integers(len(_LININGS))], rng)
+    for thing, count in _SCATTERED:
+        for _ in range(count):
+            mesh, length, width = thing(rng)
+            site.add(mesh, site.somewhere(length, width, rng))
 
 
 def _line(
