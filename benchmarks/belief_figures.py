@@ -27,7 +27,7 @@ def draw_reliability(scores: Mapping[str, Scores], path: Path) -> None:
     Below each panel is how many decisions each bin of confidence holds.
 
     Args:
-        scores: Sets of decisions by their title, from left to right; at least one.
+        scores: Scores of sets of decisions by their title, from left to right; at least one.
         path: Image to write.
     """
     figure = Figure(figsize=(4.6 * len(scores), 5.6), layout="constrained")
@@ -83,7 +83,7 @@ def draw_p_true(worlds: Mapping[str, Sequence[WorldBelief]], path: Path) -> None
     """Draw the probability that the true topology has at the end, one dot per world.
 
     Args:
-        worlds: Worlds by family, from left to right; at least one.
+        worlds: Worlds by the name of their group, from left to right; at least one group.
         path: Image to write.
     """
     figure = Figure(figsize=(1.4 * len(worlds) + 2.4, 4.2), layout="constrained")

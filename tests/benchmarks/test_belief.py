@@ -13,7 +13,6 @@ from benchmarks.belief import report_of
 from benchmarks.calibration import score
 from benchmarks.scoring import Decision, Option, Placement, always_new, decide
 from benchmarks.world_belief import WorldBelief
-from hmt_service.sim.worlds.families import Family
 from tests.benchmarks.test_scoring import ALL_NEW, RING, TRUTH, topology
 
 VISITS = range(1, 6)
@@ -101,7 +100,7 @@ def test_a_filter_that_always_says_new() -> None:
 
 
 def test_the_numbers_of_a_report(tmp_path: Path) -> None:
-    report = report_of({Family.OFFICE: [GOOD], Family.ALIASED: [BAD]}, tmp_path)
+    report = report_of({"office": [GOOD], "aliased": [BAD]}, tmp_path)
     values = {metric.key: metric.value for metric in report.metrics}
     assert values["all/worlds"] == 2
     assert values["all/p_true"] == pytest.approx(0.45)
@@ -131,7 +130,7 @@ def test_the_numbers_of_a_report(tmp_path: Path) -> None:
 
 def test_what_has_no_value_is_said(tmp_path: Path) -> None:
     lost = world([NEW], p_true=0.0, false_loops=1, is_planar=False)
-    report = report_of({Family.GARAGE: [lost]}, tmp_path)
+    report = report_of({"garage": [lost]}, tmp_path)
     assert report.skipped == (
         "all/contested: none of 1 decisions is",
         "nees_3d/arcs: 1 maps, none of them right",
@@ -141,7 +140,7 @@ def test_what_has_no_value_is_said(tmp_path: Path) -> None:
 
 
 def test_figures_are_drawn(tmp_path: Path) -> None:
-    report = report_of({Family.OFFICE: [GOOD, GOOD], Family.ALIASED: [BAD]}, tmp_path)
+    report = report_of({"office": [GOOD, GOOD], "aliased": [BAD]}, tmp_path)
     assert [path.name for path in report.figures] == ["reliability.png", "p_true.png"]
     for path in report.figures:
         image = imread(path)
