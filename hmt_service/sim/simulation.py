@@ -23,7 +23,7 @@ from hmt_service.sim.places import RADIUS_M as PLACE_RADIUS_M
 from hmt_service.sim.places import Places
 from hmt_service.sim.raycasting import RayCaster
 from hmt_service.sim.sensors import DeadReckoning, Laser2d, Lidar3d, WheelOdometry
-from hmt_service.sim.trajectories import STEP_S, Motion, PathFollower
+from hmt_service.sim.trajectories import Motion, PathFollower, steps_of
 from hmt_service.sim.worlds.world import World
 
 # What is cast at once: enough to keep the threads busy, little enough to stay in small memory.
@@ -55,11 +55,14 @@ SHORT_SIGHTED = Robot(
 )
 """For worlds whose places look alike: neither its laser nor its wheels tell them apart."""
 OUTDOOR_LASER = Robot(
-    follower=PathFollower(speed_m_s=1.2, turn_rad_s=1.8),
+    follower=PathFollower(speed_m_s=1.2, turn_rad_s=1.2, caution=4.0),
     sensor=Laser2d(field_of_view_rad=math.pi, max_range_m=30.0),
 )
 """Walking pace, between buildings: 180 degrees, 361 beams, 30 m."""
-LIDAR = Robot(follower=PathFollower(speed_m_s=1.5, turn_rad_s=2.5), sensor=Lidar3d())
+LIDAR = Robot(
+    follower=PathFollower(speed_m_s=1.5, turn_rad_s=1.2, caution=4.0),
+    sensor=Lidar3d(),
+)
 """Up and down ramps: 16 rows of 720 columns, 60 m."""
 
 
@@ -123,15 +126,15 @@ def _stretches(
     first = number = 0
     while True:
         stamps_s = np.arange(number, number + scans, dtype=np.float64) * period_s
-        needed = math.ceil(stamps_s[-1] / STEP_S) + 1 - first
-        poses.extend(each.reference_from_body for each in islice(drive, needed - len(poses)))
-        end_s = (first + len(poses) - 0.5) * STEP_S
-        stamps_s = stamps_s[stamps_s < end_s]
-        if len(stamps_s):
-            yield stamps_s, Motion(first * STEP_S, np.stack(poses))
-        if len(poses) < needed:
+        steps = steps_of(stamps_s)
+        missing = math.ceil(steps[-1]) + 1 - first - len(poses)
+        poses.extend(each.reference_from_body for each in islice(drive, missing))
+        driven = steps <= first + len(poses) - 1
+        if driven.any():
+            yield stamps_s[driven], Motion(first, np.stack(poses))
+        if not driven.all():
             return
         number += scans
-        while (first + 1) * STEP_S < (number - 1) * period_s:
+        while first + 1 <= steps[-1]:
             poses.popleft()
             first += 1

@@ -25,7 +25,7 @@ _GOAL_M = 0.1
 _TURN_GAIN_HZ = 3.0
 _WHEELBASE_M = 0.5
 _BLOCK = 512
-_STAMP_DECIMALS = 9
+_STEP_DECIMALS = 9
 
 
 @checked
@@ -38,6 +38,9 @@ class PathFollower(Declared):
     """Fastest turn."""
     look_ahead_m: float = Field(default=0.4, gt=_GOAL_M)
     """Distance of the point: corners are cut by less than half of it."""
+    caution: float = Field(default=1.0, ge=1.0)
+    """Power of the cosine of the angle to the point that the robot slows down by: a fast robot that
+    turns slowly needs more, or it overshoots the corners."""
 
     def drive(self, route_m: FloatArray) -> Iterator[StampedPose]:
         """Return the poses from the first waypoint to the last, `STEP_S` apart, as they come.
@@ -93,23 +96,28 @@ class PathFollower(Declared):
                 return
             error = math.remainder(math.atan2(carrot_y - y, carrot_x - x) - yaw, math.tau)
             turn = max(-self.turn_rad_s, min(self.turn_rad_s, _TURN_GAIN_HZ * error))
-            speed = self.speed_m_s * max(0.0, math.cos(error))
+            speed = self.speed_m_s * max(0.0, math.cos(error)) ** self.caution
             x += speed * math.cos(yaw) * STEP_S
             y += speed * math.sin(yaw) * STEP_S
             yaw += turn * STEP_S
 
 
+def steps_of(stamps_s: FloatArray) -> FloatArray:
+    """Return stamps in steps of a drive; rounded, so that the stamp of a pose is a whole number."""
+    return np.round(stamps_s / STEP_S, _STEP_DECIMALS)
+
+
 class Motion:
     """A stretch of a drive, which can be asked for the pose at any time in it."""
 
-    def __init__(self, first_stamp_s: float, poses: FloatArray) -> None:
-        """Take the poses of a drive.
+    def __init__(self, first_step: int, poses: FloatArray) -> None:
+        """Take some of the poses of a drive.
 
         Args:
-            first_stamp_s: Stamp of the first pose.
+            first_step: Number of the first of them, from 0.
             poses: Poses `STEP_S` apart, shape (N, 4, 4), N >= 1.
         """
-        self._first_stamp_s = first_stamp_s
+        self._first_step = first_step
         self._poses = poses
         steps = log(np.linalg.inv(poses[:-1]) @ poses[1:])
         self._steps = np.concatenate([steps, np.zeros((1, 6))])
@@ -119,9 +127,7 @@ class Motion:
 
         Before the first pose and after the last one the robot stands still.
         """
-        # Rounded, so that the stamp of a pose gives that pose to the bit.
-        at = np.round((stamps_s - self._first_stamp_s) / STEP_S, _STAMP_DECIMALS)
-        at = at.clip(0.0, len(self._poses) - 1.0)
+        at = (steps_of(stamps_s) - self._first_step).clip(0.0, len(self._poses) - 1.0)
         before = at.astype(np.intp)
         return self._poses[before] @ exp((at - before)[..., None] * self._steps[before])
 

@@ -48,7 +48,7 @@ def seen_by(
     """Return what a robot sees that stands still in front of the wall, alone."""
     rng = np.random.default_rng(seed)
     nobody = Crowd(WALL.route_m, 0, rng)
-    motion = Motion(0.0, world_from_body[None])
+    motion = Motion(0, world_from_body[None])
     stretches = [(np.arange(float(scans)), motion)]
     return tuple(scan for _, scan in sensor.observe(RayCaster(WALL), nobody, stretches, 1.0, rng))
 
@@ -148,7 +148,7 @@ def swept(lidar: Lidar3d, poses: np.ndarray, stamps_s: list[float], period_s: fl
     """Return what a LiDAR sends from the room, alone, while it moves."""
     rng = np.random.default_rng(0)
     world = room()
-    stretches = [(np.array(stamps_s), Motion(0.0, poses))]
+    stretches = [(np.array(stamps_s), Motion(0, poses))]
     nobody = Crowd(world.route_m, 0, rng)
     observed = lidar.observe(RayCaster(world), nobody, stretches, period_s, rng)
     return [scan for _, scan in observed]

@@ -165,14 +165,14 @@ def twisting(xi: np.ndarray, steps: int) -> np.ndarray:
 def test_motion_gives_its_poses_and_moves_steadily_in_between() -> None:
     xi = np.array([0.01, -0.02, 0.03, 0.02, 0.01, -0.01])
     poses = twisting(xi, 10)
-    motion = Motion(3.0, poses)
+    motion = Motion(150, poses)
     assert np.array_equal(motion.at(3.0 + STEP_S * np.arange(11.0)), poses)
     assert motion.at(np.array([3.0 + 2.25 * STEP_S])) == pytest.approx(exp(2.25 * xi[None]))
 
 
 def test_robot_stands_still_before_and_after_a_motion() -> None:
     poses = twisting(np.array([0.0, 0.0, 0.0, 0.1, 0.0, 0.0]), 3)
-    at = Motion(1.0, poses).at(np.array([[-5.0, 0.99], [1.0 + 3 * STEP_S, 7.0]]))
+    at = Motion(50, poses).at(np.array([[-5.0, 0.99], [1.0 + 3 * STEP_S, 7.0]]))
     assert np.array_equal(at, np.array([[poses[0], poses[0]], [poses[3], poses[3]]]))
 
 
