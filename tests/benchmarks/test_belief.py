@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -116,6 +117,10 @@ def test_the_numbers_of_a_report(tmp_path: Path) -> None:
     assert values["all/contested/brier"] == pytest.approx((0.04 + 0.81) / 4)
     # 0.8 is right; of 1, 1 and 0.9, which share a bin, two are.
     assert values["all/contested/calibration_error"] == pytest.approx((0.2 + 0.9) / 4)
+    assert values["all/contested/calibration"] == pytest.approx(1.0 - 1.1 / 4)
+    assert values["all/contested/p_right"] == pytest.approx((0.8 * 0.1) ** 0.25)
+    assert values["all/brier_skill"] == pytest.approx(1.0 - 0.85 / 4)
+    assert values["all/log_skill"] == pytest.approx(1.0 + math.log(0.08) / (4 * 13.815511))
     assert values["always_new/map_right"] == 0.0
     assert values["always_new/brier"] == pytest.approx(4 / 7)
     assert values["always_new/placed_right"] == 0.5
