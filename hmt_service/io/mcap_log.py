@@ -201,4 +201,4 @@ class McapWriter:
 
     def finish(self) -> None:
         """Write what is left, and the index."""
-        self._writer.finish()  # type: ignore[no-untyped-call]
+        self._writer.finish()

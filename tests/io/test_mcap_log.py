@@ -78,7 +78,7 @@ def recorded(
             assert isinstance(message, LaserScan | PointCloud | Odometry | PoseInFrame)
             time = message.timestamp.ToNanoseconds()
             writer.add_message(channels[key], time, message.SerializeToString(), time)
-        writer.finish()  # type: ignore[no-untyped-call]
+        writer.finish()
     return path
 
 
@@ -207,7 +207,7 @@ def test_small_disorder_is_mended_and_odometry_comes_first(tmp_path: Path) -> No
                 schema = register_schema(writer, type(message))
                 channels[topic] = writer.register_channel(topic, "protobuf", schema)
             writer.add_message(channels[topic], time, message.SerializeToString(), time)
-        writer.finish()  # type: ignore[no-untyped-call]
+        writer.finish()
     log = read(tmp_path / "log.mcap")
     assert keys(log) == [(float(s), is_scan) for s in range(6) for is_scan in (False, True)]
     assert log.malformed == ()
@@ -315,7 +315,7 @@ def test_messages_of_other_kinds_and_encodings_are_passed_over(tmp_path: Path) -
             writer.add_message(json, time, b"{}", time)
             writer.add_message(strange, time, b"\xff", time)
             writer.add_message(scans, time, scan.SerializeToString(), time)
-        writer.finish()  # type: ignore[no-untyped-call]
+        writer.finish()
     log = read(path)
     assert (log.scans, log.unread, len(keys(log))) == (3, (), 3)
 
