@@ -27,7 +27,7 @@ from hmt_service.sim.trajectories import Motion, PathFollower, steps_of
 from hmt_service.sim.worlds.world import World
 
 # What is cast at once: enough to keep the threads busy, little enough to stay in small memory.
-_RAYS_AT_ONCE = 1 << 17
+_RAYS_AT_ONCE = 1 << 16
 _SCANS_AT_ONCE = 64
 
 
