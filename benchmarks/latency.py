@@ -89,13 +89,14 @@ def measure(run: Run) -> Report:
     effort = _QUICK if run.is_quick else _FULL
     source, read, skipped = _source()
 
-    @cache
-    def readings() -> tuple[Reading, ...]:  # a resumed run may not need them
-        run.say(f"{source}: reading")
-        return steady(read(effort.scans_at_full_speed), rate_hz=RATE_HZ)
-
     with ProcessPoolExecutor(1 + len(Question), get_context("spawn")) as processes:
-        processes.map(rest, range(1 + len(Question)))  # loads the libraries meanwhile
+
+        @cache
+        def readings() -> tuple[Reading, ...]:  # a resumed run may need neither them nor processes
+            run.say(f"{source}: reading")
+            processes.map(rest, range(1 + len(Question)))  # loads the libraries meanwhile
+            return steady(read(effort.scans_at_full_speed), rate_hz=RATE_HZ)
+
         cost = run.once("throughput", lambda: throughput(readings(), processes))
         sensor_rate = run.once(
             _SENSOR_RATE,

@@ -5,12 +5,22 @@ from __future__ import annotations
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from benchmarks.cells import Cells, Result
 from benchmarks.clients import Question
-from benchmarks.latency import percentiles_ms, scan_to_pose, steady, throughput, under_load
+from benchmarks.latency import (
+    measure,
+    percentiles_ms,
+    scan_to_pose,
+    steady,
+    throughput,
+    under_load,
+)
+from benchmarks.report import Report, Run
 from hmt_service.core.geometry import identity
 from hmt_service.core.types import OdometryReading, Reading, Scan
 from hmt_service.errors import DaemonFailure
@@ -88,6 +98,61 @@ def test_percentiles_of_nothing_are_an_error() -> None:
         percentiles_ms([])
 
 
+# ------------------------------------------------------------------ the report
+
+
+def answers(*milliseconds: float) -> dict[str, list[float]]:
+    return {question: [1e-3 * each for each in milliseconds] for question in Question}
+
+
+def load(scan_to_pose_ms: float, *milliseconds: float, lost: int = 0) -> Result:
+    scans_s = {"scan_to_pose": [1e-3 * scan_to_pose_ms]}
+    return {
+        "load": {**scans_s, **answers(*milliseconds)},
+        "idle": answers(2.0),
+        "unmatched": 3,
+        "lost": lost,
+    }
+
+
+def measured(folder: Path, sensor_rate: Result, full_speed: Result) -> Report:
+    """Return the report of a run that finds all of its units of work done."""
+    cells = Cells(folder / "cells", "a", is_resumed=True)
+    cells.write("throughput", {"one_process_s": 2.0, "daemon_s": 3.0, "scans": 400, "lost": 0})
+    sensor_rate["load"]["release_to_pose"] = [0.01]
+    cells.write("sensor_rate", sensor_rate)
+    cells.write("full_speed", full_speed)
+    return measure(Run(True, lambda _: None, folder, cells))
+
+
+def test_a_resumed_run_reports_the_units_that_it_has(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("HMT_DATA", raising=False)
+    found = measured(tmp_path, load(260.0, 2.0, 3.0, 4.0, lost=1), load(5000.0, 8.0, lost=2))
+    values = {metric.key.removeprefix("office/"): metric.value for metric in found.metrics}
+    assert values["over_one_process"] == 1.5
+    assert values["scans_lost"] == 3.0
+    assert values["sensor_rate/scans_without_pose"] == 3.0
+    assert values["sensor_rate/scan_to_pose/p50"] == pytest.approx(260.0)
+    assert values["sensor_rate/pose/max"] == pytest.approx(4.0)
+    assert values["sensor_rate/pose/p50_over_idle"] == pytest.approx(1.5)
+    assert values["full_speed/map_points/p50_over_idle"] == pytest.approx(4.0)
+    # 10 ms from release to pose; 2 s for 400 scans are 5 ms each.
+    assert values["release_to_pose_over_one_process"] == pytest.approx(2.0)
+    assert found.skipped == (
+        "intel, simulated office instead: HMT_DATA does not name the folder of recorded logs",
+    )
+    assert [figure.stat().st_size > 0 for figure in found.figures] == [True]
+
+
+def test_only_ratios_of_medians_and_losses_are_gated(tmp_path: Path) -> None:
+    metrics = measured(tmp_path, load(260.0, 2.0), load(5000.0, 8.0)).metrics
+    gated = [metric for metric in metrics if metric.rel_tol is not None]
+    assert {metric.unit for metric in gated} == {"1"}
+    assert not any("p99" in metric.key or "max" in metric.key for metric in gated)
+
+
 # ------------------------------------------------------------------ end to end
 
 
@@ -99,13 +164,13 @@ def test_a_daemon_answers_while_scans_come_in_and_each_scan_gets_its_pose() -> N
     assert (cost["scans"], cost["lost"], result["lost"]) == (80, 0, 0)
     assert cost["daemon_s"] > 0.0
     assert cost["one_process_s"] > 0.0
-    load, idle = result["load"], result["idle"]
-    assert len(load["scan_to_pose"]) + result["unmatched"] == 80
+    loaded, idle = result["load"], result["idle"]
+    assert len(loaded["scan_to_pose"]) + result["unmatched"] == 80
     # Scans before the first map have no pose yet; the last ones are released by the end.
-    assert len(load["scan_to_pose"]) > len(load["release_to_pose"]) > 0
+    assert len(loaded["scan_to_pose"]) > len(loaded["release_to_pose"]) > 0
     assert set(idle) == set(Question)
     assert all(
-        latency_s > 0.0 for times_s in (*load.values(), *idle.values()) for latency_s in times_s
+        latency_s > 0.0 for times_s in (*loaded.values(), *idle.values()) for latency_s in times_s
     )
-    assert load["pose"]
+    assert loaded["pose"]
     assert all(idle.values())

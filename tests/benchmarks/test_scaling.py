@@ -11,12 +11,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from benchmarks.cells import Result
+from benchmarks.cells import Cells, Result
 from benchmarks.long_drive import Checkpoint, End, Entry
+from benchmarks.report import Run
 from benchmarks.scaling import (
     CHECKPOINTS,
     Stretch,
     growth_exponent,
+    measure,
     projected_s,
     report,
     stretches_of,
@@ -210,6 +212,13 @@ def test_a_map_that_failed_keeps_what_was_measured_and_the_gate_sees_it(tmp_path
     (failures,) = set(failed.metrics) - set(well.metrics)
     assert (failures.key, failures.value, failures.rel_tol) == ("failures", 1.0, 0.0)
     assert len(failed.metrics) == len(well.metrics)
+
+
+def test_a_resumed_run_does_not_drive_again(tmp_path: Path) -> None:
+    cells = Cells(tmp_path / "cells", "a", is_resumed=True)
+    cells.write("drive", driven([entry(areas) for areas in range(1, 51)], [10, 30]))
+    found = measure(Run(True, lambda _: None, tmp_path, cells))
+    assert {metric.key: metric.value for metric in found.metrics}["largest"] == 50.0
 
 
 @pytest.mark.parametrize("areas", [0, 5])
