@@ -8,23 +8,29 @@ References:
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import gtsam
 import numpy as np
+import numpy.typing as npt
 
 from hmt_service.core.geometry import (
+    FloatArray,
     GaussianPose,
     Pose,
     adjoint,
     identity,
     inverse,
-    project_planar,
+    planar_covariance,
+    planar_pose,
     symmetric,
+    yaw_of,
 )
 
-# The first frame is the reference: fixed, up to what keeps the normal equations well conditioned.
-_REFERENCE_SIGMA = 1e-5
+# The first frame is the reference. How well it is known cancels in relative poses: of the order of
+# an arc's own uncertainty, it keeps the normal equations well conditioned.
+_REFERENCE_SIGMA = 1e-2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,6 +45,54 @@ class Factor:
     """Relative pose."""
 
 
+@dataclass(frozen=True, slots=True)
+class _Space:
+    """The poses that a graph is over, as gtsam has them."""
+
+    axes: npt.NDArray[np.intp]
+    """Rows of our tangent `[rotation, translation]`, in the order of gtsam's."""
+    value: Callable[[Pose], gtsam.Pose2 | gtsam.Pose3]
+    """Makes a value of gtsam."""
+    pose: Callable[[gtsam.Values, int], Pose]
+    """Takes the pose of a visit out of a solution."""
+    prior: Callable[..., gtsam.NonlinearFactor]
+    """Factor of one pose."""
+    between: Callable[..., gtsam.NonlinearFactor]
+    """Factor of two poses."""
+
+    def noise(self, covariance: FloatArray) -> gtsam.noiseModel.Base:
+        """Return the noise of a factor with this covariance, shape (6, 6)."""
+        return gtsam.noiseModel.Gaussian.Covariance(covariance[np.ix_(self.axes, self.axes)])
+
+    def covariance(self, reduced: FloatArray) -> FloatArray:
+        """Return a covariance in gtsam's order as one in ours, shape (6, 6)."""
+        covariance = np.zeros((6, 6))
+        covariance[np.ix_(self.axes, self.axes)] = reduced
+        return covariance if len(self.axes) == 6 else planar_covariance(covariance)
+
+
+_SPATIAL = _Space(
+    axes=np.arange(6),
+    value=gtsam.Pose3,
+    pose=lambda values, visit: values.atPose3(visit).matrix(),
+    prior=gtsam.PriorFactorPose3,
+    between=gtsam.BetweenFactorPose3,
+)
+# Not Pose3 with tiny variances off the plane: over long chains they leave a matrix that gtsam
+# cannot factorise.
+_PLANAR = _Space(
+    axes=np.array([3, 4, 2]),
+    value=lambda pose: gtsam.Pose2(pose[0, 3], pose[1, 3], yaw_of(pose)),
+    pose=lambda values, visit: _from_pose2(values.atPose2(visit)),
+    prior=gtsam.PriorFactorPose2,
+    between=gtsam.BetweenFactorPose2,
+)
+
+
+def _from_pose2(pose: gtsam.Pose2) -> Pose:
+    return planar_pose(pose.x(), pose.y(), pose.theta())
+
+
 class PoseGraph:
     """Poses of visits tied by Gaussian arcs; cheap to copy, solved on demand."""
 
@@ -48,7 +102,7 @@ class PoseGraph:
         Args:
             is_planar: Whether solved poses are kept planar exactly.
         """
-        self._is_planar = is_planar
+        self._space = _PLANAR if is_planar else _SPATIAL
         self._factors: dict[tuple[int, int], Factor] = {}
         self._poses: dict[int, Pose] = {}
         self._marginals: gtsam.Marginals | None = None
@@ -56,7 +110,7 @@ class PoseGraph:
 
     def copy(self) -> PoseGraph:
         """Return an independent graph that shares the factors, which are immutable."""
-        other = PoseGraph(is_planar=self._is_planar)
+        other = PoseGraph(is_planar=self._space is _PLANAR)
         other._factors = dict(self._factors)
         other._poses = dict(self._poses)
         other._marginals = self._marginals
@@ -108,8 +162,11 @@ class PoseGraph:
                 [marginal.at(visit_b, visit_a), marginal.at(visit_b, visit_b)],
             ]
         )
-        jacobian = np.hstack([-adjoint(inverse(a_from_b)), np.eye(6)])
-        return GaussianPose(a_from_b, symmetric(jacobian @ joint @ jacobian.T))
+        axes = self._space.axes
+        moved = adjoint(inverse(a_from_b))[np.ix_(axes, axes)]
+        jacobian = np.hstack([-moved, np.eye(len(axes))])
+        covariance = self._space.covariance(jacobian @ joint @ jacobian.T)
+        return GaussianPose(a_from_b, symmetric(covariance))
 
     def _change(self) -> None:
         self._is_solved = False
@@ -121,10 +178,7 @@ class PoseGraph:
         graph, values = self._gtsam()
         parameters = gtsam.LevenbergMarquardtParams()
         solution = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
-        poses = {visit: solution.atPose3(visit).matrix() for visit in self._poses}
-        if self._is_planar:
-            poses = {visit: project_planar(pose) for visit, pose in poses.items()}
-        self._poses = poses
+        self._poses = {visit: self._space.pose(solution, visit) for visit in self._poses}
         self._is_solved = True
 
     def _solved_marginals(self) -> gtsam.Marginals:
@@ -134,21 +188,17 @@ class PoseGraph:
         return self._marginals
 
     def _gtsam(self) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+        space = self._space
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         for visit, pose in self._poses.items():
-            values.insert(visit, gtsam.Pose3(pose))
-        first = min(self._poses)
-        graph.add(
-            gtsam.PriorFactorPose3(
-                first,
-                gtsam.Pose3(identity()),
-                gtsam.noiseModel.Isotropic.Sigma(6, _REFERENCE_SIGMA),
-            )
-        )
+            values.insert(visit, space.value(pose))
+        known = space.noise(_REFERENCE_SIGMA**2 * np.eye(6))
+        graph.add(space.prior(min(self._poses), space.value(identity()), known))
         for factor in self.factors:
-            noise = gtsam.noiseModel.Gaussian.Covariance(factor.a_from_b.covariance)
-            measured = gtsam.Pose3(factor.a_from_b.mean)
-            graph.add(gtsam.BetweenFactorPose3(factor.visit_a, factor.visit_b, measured, noise))
+            measured, noise = factor.a_from_b, space.noise(factor.a_from_b.covariance)
+            graph.add(
+                space.between(factor.visit_a, factor.visit_b, space.value(measured.mean), noise)
+            )
         return graph, values
 
 
