@@ -62,7 +62,7 @@ def _draw_reliability(axes: Axes, scores: Scores) -> None:
         color=_BLUE,
         capsize=3.0,
     )
-    axes.set(xlim=(-0.02, 1.02), ylim=(-0.02, 1.02), aspect="equal")
+    axes.set(xlim=(-0.02, 1.02), ylim=(-0.02, 1.02))
     axes.grid(color="0.92", linewidth=0.6)
 
 
