@@ -56,7 +56,7 @@ class _Effort:
 
 
 _QUICK = _Effort(rooms=1_000, budget_s=12.0)
-_FULL = _Effort(rooms=15_000, budget_s=1_200.0)
+_FULL = _Effort(rooms=15_000, budget_s=600.0)
 
 
 @dataclass(frozen=True, slots=True)
