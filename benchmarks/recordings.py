@@ -36,14 +36,14 @@ class Missing:
     """Why not, for a person; names no folder of this machine."""
 
 
-def recorded_file(name: str) -> Path | Missing:
-    """Return a file below `HMT_DATA/2d`, or why there is none."""
-    folder = os.environ.get("HMT_DATA")
-    if not folder:
+def recorded_file(name: str, folder: str = "2d") -> Path | Missing:
+    """Return a file below a folder of `HMT_DATA`, or why there is none."""
+    data = os.environ.get("HMT_DATA")
+    if not data:
         return Missing("HMT_DATA does not name the folder of recorded logs")
-    path = Path(folder) / "2d" / name
+    path = Path(data) / folder / name
     if not path.is_file():
-        return Missing(f"no file 2d/{name} in the folder that HMT_DATA names")
+        return Missing(f"no file {folder}/{name} in the folder that HMT_DATA names")
     return path
 
 
