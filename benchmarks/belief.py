@@ -58,13 +58,13 @@ def _usual(family: Family, seeds: Sequence[int]) -> _Group:
 _FULL = {
     "garage": _usual(Family.GARAGE, range(5)),
     "campus": _Group(Family.CAMPUS, range(2), USUAL_ROBOTS[Family.CAMPUS], {"relief_m": 0.0}),
-    "nested-loops": _usual(Family.NESTED_LOOPS, range(10)),
-    "warehouse": _usual(Family.WAREHOUSE, range(10)),
-    "warehouse-blind": _Group(Family.WAREHOUSE, range(10, 15), BLIND),
-    "aliased": _usual(Family.ALIASED, range(10)),
-    "aliased-blind": _Group(Family.ALIASED, range(10, 20), BLIND, {"severity": 1.0}),
-    "office": _usual(Family.OFFICE, range(10)),
-    "office-blind": _Group(Family.OFFICE, range(10, 20), BLIND),
+    "nested-loops": _usual(Family.NESTED_LOOPS, range(6)),
+    "warehouse": _usual(Family.WAREHOUSE, range(6)),
+    "warehouse-blind": _Group(Family.WAREHOUSE, range(10, 14), BLIND),
+    "aliased": _usual(Family.ALIASED, range(8)),
+    "aliased-blind": _Group(Family.ALIASED, range(10, 18), BLIND, {"severity": 1.0}),
+    "office": _usual(Family.OFFICE, range(6)),
+    "office-blind": _Group(Family.OFFICE, range(10, 16), BLIND),
 }
 _QUICK = {
     "office": _usual(Family.OFFICE, [0]),
