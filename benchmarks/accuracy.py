@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import os
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from functools import partial
 from itertools import islice
@@ -22,6 +22,7 @@ from benchmarks.cells import Result
 from benchmarks.metric import Direction, Metric
 from benchmarks.recordings import Missing, first_scans, read_recorded, recorded_file
 from benchmarks.report import Report, Run
+from benchmarks.simulated import readings_of
 from benchmarks.trajectories import (
     TrajectoryErrors,
     mean_errors,
@@ -30,11 +31,11 @@ from benchmarks.trajectories import (
 )
 from hmt_service.core.config import load_config
 from hmt_service.core.engine import Engine
-from hmt_service.core.types import Reading, StampedPose
+from hmt_service.core.types import StampedPose
 from hmt_service.io.relations import ErrorStatistics, Relations, evaluate, read_relations
 from hmt_service.runtime.messages import RunReport
 from hmt_service.runtime.offline import map_readings
-from hmt_service.sim.simulation import Instant, simulate
+from hmt_service.sim.simulation import simulate
 from hmt_service.sim.usual import USUAL_ROBOTS, preset_for
 from hmt_service.sim.worlds.families import Family, draw
 
@@ -95,15 +96,8 @@ def _map_world(family: Family, seed: int, scans: int | None) -> Result:
     robot = USUAL_ROBOTS[family]
     instants = islice(simulate(draw(family, seed), robot, seed), scans)
     truth: list[StampedPose] = []
-    engine, _ = map_readings(_readings(instants, truth), load_config(preset_for(robot)))
+    engine, _ = map_readings(readings_of(instants, truth), load_config(preset_for(robot)))
     return asdict(trajectory_errors(engine.trajectory(), truth))
-
-
-def _readings(instants: Iterable[Instant], truth: list[StampedPose]) -> Iterator[Reading]:
-    """Yield what the robot sends, and note where it is."""
-    for instant in instants:
-        truth.append(instant.truth)
-        yield from instant.readings
 
 
 # ------------------------------------------------------------------ recorded logs
@@ -115,7 +109,6 @@ def _measure_recorded(run: Run, name: str) -> Report:
         return Report((), (f"{name}: {log.reason}",))
     if isinstance(truth, Missing):
         return Report((), (f"{name}: {truth.reason}",))
-    run.say(name)
     result = run.once(f"recorded/{name}", partial(_map_log, name, log, truth, run.is_quick))
     return _REPORT.validate_python(result)
 

@@ -27,8 +27,8 @@ def map_scans(readings: Path, result: Path) -> None:
         result: File to write.
     """
     # Only where this runs as a program.
-    from kiss_slam.config import load_config  # type: ignore[import-not-found]
-    from kiss_slam.slam import KissSLAM  # type: ignore[import-not-found]
+    from kiss_slam.config import load_config
+    from kiss_slam.slam import KissSLAM
 
     slam, process, watch = KissSLAM(load_config(None)), psutil.Process(), _Watch()
     empty_bytes = process.memory_info().rss

@@ -36,9 +36,10 @@ from benchmarks.processes import ChildFailed
 from benchmarks.recordings import Missing, read_recorded, recorded_file
 from benchmarks.report import Report, Run
 from benchmarks.revisits import gap_m, revisits
+from benchmarks.simulated import readings_of
 from benchmarks.trajectories import TrajectoryErrors, mean_errors, metrics_of, trajectory_errors
 from hmt_service.core.config import Preset, load_config
-from hmt_service.core.types import OdometryReading, Reading, StampedPose
+from hmt_service.core.types import OdometryReading, StampedPose
 from hmt_service.sim.simulation import LIDAR, simulate
 from hmt_service.sim.worlds.families import Family, draw
 
@@ -113,14 +114,9 @@ def _drives(is_quick: bool) -> tuple[dict[str, list[Source]], list[str]]:
 
 
 def _simulated(family: Family, seed: int, scans: int | None, path: Path) -> tuple[StampedPose, ...]:
-    truth = []
-
-    def readings() -> Iterator[Reading]:
-        for instant in islice(simulate(draw(family, seed), LIDAR, seed), scans):
-            truth.append(instant.truth)
-            yield from instant.readings
-
-    write_readings(readings(), path)
+    truth: list[StampedPose] = []
+    instants = islice(simulate(draw(family, seed), LIDAR, seed), scans)
+    write_readings(readings_of(instants, truth), path)
     return tuple(truth)
 
 
