@@ -96,7 +96,7 @@ def _map_world(family: Family, seed: int, scans: int | None) -> Result:
     robot = USUAL_ROBOTS[family]
     instants = islice(simulate(draw(family, seed), robot, seed), scans)
     truth: list[StampedPose] = []
-    engine, _ = map_readings(readings_of(instants, truth), load_config(preset_for(robot)))
+    engine, _ = map_readings(readings_of(instants, truth), load_config(preset_for(robot, family)))
     return asdict(trajectory_errors(engine.trajectory(), truth))
 
 

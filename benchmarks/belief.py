@@ -24,7 +24,7 @@ from benchmarks.metric import Direction, Metric
 from benchmarks.report import Report, Run
 from benchmarks.scoring import Decision
 from benchmarks.world_belief import WorldBelief, as_result, believe, from_result
-from hmt_service.core.config import Preset, load_config
+from hmt_service.core.config import load_config
 from hmt_service.sim.sensors import Laser2d, WheelOdometry
 from hmt_service.sim.simulation import Robot, simulate
 from hmt_service.sim.usual import USUAL_ROBOTS, preset_for
@@ -99,7 +99,7 @@ def measure(run: Run) -> Report:
 def _believe(group: _Group, seed: int) -> Result:
     world = draw(group.family, seed, **group.parameters)
     instants = simulate(world, group.robot, seed)
-    return as_result(believe(instants, load_config(preset_for(group.robot))))
+    return as_result(believe(instants, load_config(preset_for(group.robot, group.family))))
 
 
 def report_of(beliefs: Mapping[str, Sequence[WorldBelief]], out: Path) -> Report:
@@ -121,13 +121,13 @@ def report_of(beliefs: Mapping[str, Sequence[WorldBelief]], out: Path) -> Report
     metrics += _against_always_new(everything)
     for name, worlds in beliefs.items():
         metrics += [*_topologies(name, worlds), *_losses(name, score(_decisions(worlds)))]
-    for preset, is_planar in ((Preset.PLANAR, True), (Preset.SPATIAL, False)):
+    for sensor, is_planar in (("2d", True), ("3d", False)):
         of_preset = [belief for belief in everything if belief.is_planar is is_planar]
         for what, errors in _errors(of_preset).items():
             if errors:
-                metrics += _consistency(f"nees_{preset}/{what}", errors, is_planar=is_planar)
+                metrics += _consistency(f"nees_{sensor}/{what}", errors, is_planar=is_planar)
             elif of_preset:
-                skipped.append(f"nees_{preset}/{what}: {len(of_preset)} maps, none of them right")
+                skipped.append(f"nees_{sensor}/{what}: {len(of_preset)} maps, none of them right")
     panels = {"All": score(decisions)} | ({"Contested": score(contested)} if contested else {})
     figures = out / "reliability.png", out / "p_true.png"
     draw_reliability(panels, figures[0])

@@ -121,7 +121,7 @@ def _simulated(family: Family, seed: int, scans: int | None, path: Path) -> tupl
 
 
 def _kitti(poses: Path, path: Path) -> tuple[StampedPose, ...]:
-    sensor = load_config(Preset.SPATIAL).sensor
+    sensor = load_config(Preset.OUTDOOR).sensor
     scans, truth = read_kitti(
         poses.parent, min_range_m=sensor.min_range_m, max_range_m=sensor.max_range_m
     )
@@ -130,7 +130,7 @@ def _kitti(poses: Path, path: Path) -> tuple[StampedPose, ...]:
 
 
 def _recorded(log: Path, path: Path) -> tuple[StampedPose, ...]:
-    write_readings(read_recorded(log, load_config(Preset.SPATIAL)), path)
+    write_readings(read_recorded(log, load_config(Preset.OUTDOOR)), path)
     return ()
 
 
@@ -140,7 +140,7 @@ def _compare(python: Path, source: Source) -> Result:
         folder = Path(name)
         readings = folder / "readings"
         truth = source(readings)
-        chain = partial(run_chain, readings, Preset.SPATIAL, folder, timeout_s=_TIMEOUT_S)
+        chain = partial(run_chain, readings, Preset.OUTDOOR, folder, timeout_s=_TIMEOUT_S)
         runs: dict[str, ChainRun | KissSlamRun] = {"hmt": chain()}
         if any(isinstance(reading, OdometryReading) for reading in read_readings(readings)):
             runs["hmt_scans_only"] = chain(has_odometry=False)

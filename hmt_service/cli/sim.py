@@ -154,6 +154,7 @@ def sim(
         ),
         **_given(scan_period_s=_period_s(rate_hz), drop_share=drop),
     )
+    preset = preset_for(robot, family)
     chosen = _given(severity=severity, areas=areas, floors=floors, relief_m=relief_m, laps=laps)
     console = Console(stderr=True)
     with console.status(f"drawing {family}"):
@@ -173,11 +174,11 @@ def sim(
                 "parameters": parameters,
                 "people": people,
                 "robot": _declared(robot, has_odometry=not no_odometry),
-                "preset": preset_for(robot),
+                "preset": preset,
                 **asdict(drive),
             }
         )
-    _report(console, out, drive, preset_for(robot))
+    _report(console, out, drive, preset)
 
 
 @dataclass(slots=True)

@@ -211,12 +211,16 @@ class Preset(StrEnum):
     """Settings per kind of sensor."""
 
     PLANAR = "2d"
-    SPATIAL = "3d"
+    """Planar laser."""
+    INDOOR = "3d-indoor"
+    """LiDAR in buildings and garages."""
+    OUTDOOR = "3d-outdoor"
+    """LiDAR on roads, between buildings, in the open."""
 
 
 _PRESETS: dict[Preset, dict[str, Any]] = {
     Preset.PLANAR: {},
-    Preset.SPATIAL: {
+    Preset.OUTDOOR: {
         "sensor": {"is_planar": False, "min_range_m": 1.0, "max_range_m": 100.0},
         "odometry": {
             "voxel_size_m": 0.75,
@@ -230,6 +234,20 @@ _PRESETS: dict[Preset, dict[str, Any]] = {
         "areas": {"cell_size_m": 1.0},
         "alignment": {"raster_m": 0.5, "inlier_m": 0.6},
         "observation": {"hit_sigma_m": 0.4, "angular_resolution_rad": 0.035},
+    },
+    Preset.INDOOR: {
+        "sensor": {"is_planar": False, "min_range_m": 0.3, "max_range_m": 60.0},
+        "odometry": {
+            "voxel_size_m": 0.25,
+            "max_correspondence_m": 1.0,
+            "kernel_m": 0.2,
+            "keyframe_distance_m": 1.0,
+            "window_keyframes": 15,
+            "max_correction_m": 2.0,
+        },
+        "areas": {"cell_size_m": 0.5},
+        "alignment": {"raster_m": 0.25, "inlier_m": 0.3},
+        "observation": {"hit_sigma_m": 0.2, "angular_resolution_rad": 0.035},
     },
 }
 

@@ -28,6 +28,8 @@ USUAL_ROBOTS: Mapping[Family, Robot] = MappingProxyType(
 """The robot of each family."""
 
 
-def preset_for(robot: Robot) -> Preset:
-    """Return the settings that fit a robot's sensor."""
-    return Preset.SPATIAL if isinstance(robot.sensor, Lidar3d) else Preset.PLANAR
+def preset_for(robot: Robot, family: Family) -> Preset:
+    """Return the settings that fit a robot's sensor and where it drives."""
+    if not isinstance(robot.sensor, Lidar3d):
+        return Preset.PLANAR
+    return Preset.OUTDOOR if family is Family.CAMPUS else Preset.INDOOR

@@ -154,12 +154,9 @@ def test_run_maps_a_simulated_laser(drive: Path, tmp_path: Path) -> None:
 
 
 def test_run_maps_a_simulated_lidar(tmp_path: Path) -> None:
-    # Finer than the preset, which is made for streets.
-    settings = tmp_path / "settings.yaml"
-    settings.write_text("odometry: {voxel_size_m: 0.2, max_correspondence_m: 0.6, kernel_m: 0.15}")
     lidar = ("--sensor", "lidar", "--columns", "120", "--fov-deg", "28")
     declared = simulated(tmp_path, "long", "--areas", "2", *lidar)
-    assert declared["preset"] == "3d"
+    assert declared["preset"] == "3d-indoor"
     sensor = declared["robot"]["sensor"]
     assert (sensor["columns"], sensor["rows"]) == (120, 16)
     assert sensor["vertical_fov_rad"] == pytest.approx(math.radians(28.0))
@@ -167,9 +164,8 @@ def test_run_maps_a_simulated_lidar(tmp_path: Path) -> None:
     scan = next(reading for reading in log.readings if isinstance(reading, Scan))
     assert scan.point_times is not None
     assert len(scan.points_in_body) > 500
-    log_file, settings_file = str(tmp_path / "log.mcap"), str(settings)
-    options = ("--preset", "3d", "--config", settings_file, "--out", str(tmp_path))
-    result = hmt("run", log_file, *options)
+    log_file = str(tmp_path / "log.mcap")
+    result = hmt("run", log_file, "--preset", "3d-indoor", "--out", str(tmp_path))
     assert result.exit_code == 0, result.output
     assert largest_error_m(tmp_path, tmp_path) < 0.3
 

@@ -19,12 +19,12 @@ def test_presets_are_valid_and_survive_a_round_trip(preset: Preset) -> None:
 
 def test_presets_differ_in_whether_the_robot_moves_in_a_plane() -> None:
     assert load_config(Preset.PLANAR).sensor.is_planar
-    assert not load_config(Preset.SPATIAL).sensor.is_planar
+    assert not load_config(Preset.OUTDOOR).sensor.is_planar
 
 
 def test_document_changes_only_what_it_names() -> None:
-    base = load_config(Preset.SPATIAL)
-    config = load_config(Preset.SPATIAL, "odometry: {voxel_size_m: 0.5}")
+    base = load_config(Preset.OUTDOOR)
+    config = load_config(Preset.OUTDOOR, "odometry: {voxel_size_m: 0.5}")
     assert config.odometry.voxel_size_m == 0.5
     assert config.odometry.model_copy(update={"voxel_size_m": 0.75}) == base.odometry
     assert config.model_copy(update={"odometry": base.odometry}) == base
@@ -32,7 +32,7 @@ def test_document_changes_only_what_it_names() -> None:
 
 @pytest.mark.parametrize("text", [None, "", "# nothing but a comment\n"])
 def test_empty_document_is_the_preset(text: str | None) -> None:
-    assert load_config(Preset.SPATIAL, text) == load_config(Preset.SPATIAL)
+    assert load_config(Preset.OUTDOOR, text) == load_config(Preset.OUTDOOR)
 
 
 @pytest.mark.parametrize(

@@ -170,7 +170,7 @@ def sphere(count: int, radius_m: float) -> FloatArray:
 
 
 def test_beams_in_space_are_told_apart_by_elevation() -> None:
-    config = load_config(Preset.SPATIAL)
+    config = load_config(Preset.OUTDOOR)
     model = ObservationModel(config.observation, config.sensor)
     points = sphere(4000, 10.0)
     points[:, 2] *= np.where(points[:, 2] > 0.0, 1.0, 0.3)  # a flattened lower half

@@ -52,7 +52,7 @@ def test_same_log_gives_the_same_file(hmt_data: Path, tmp_path: Path) -> None:
 def test_lidar_without_odometry_is_tracked_to_a_few_per_cent(hmt_data: Path) -> None:
     folder = hmt_data / "3d/kitti00-part"
     truth = np.loadtxt(folder / "poses.txt").reshape(-1, 3, 4)[:40]
-    config = load_config(Preset.SPATIAL)
+    config = load_config(Preset.OUTDOOR)
     scans = []
     for number in range(len(truth)):
         file = folder / f"velodyne/{number:06d}.bin"
