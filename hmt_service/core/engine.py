@@ -22,6 +22,7 @@ from hmt_service.core.geometry import GaussianPose, Pose, inverse, log
 from hmt_service.core.graph import Factor, PoseGraph
 from hmt_service.core.hypotheses import Assignment, Hypothesis, ParticleLayer
 from hmt_service.core.observation import ObservationModel
+from hmt_service.core.plausibility import Plausibility
 from hmt_service.core.refinement import Refinement
 from hmt_service.core.stored import (
     StoredAssignment,
@@ -67,6 +68,7 @@ class Engine:
         self._seed = seed
         rng = np.random.default_rng(seed)
         aligner = Aligner(config)
+        self._plausibility = Plausibility(config.sensor)
         self._observation = ObservationModel(config.observation, config.sensor)
         self._transition = Transition(config, aligner, self._observation, rng)
         self._refinement = Refinement(config, aligner)
@@ -101,6 +103,10 @@ class Engine:
             return ()
         self._revision += 1
         self._observation.learn(keyframe)
+        return (*self._plausibility.check(keyframe), *self._map(keyframe))
+
+    def _map(self, keyframe: Keyframe) -> tuple[Event, ...]:
+        """Add a keyframe to every hypothesis."""
         if not self._visits:
             return self._begin(keyframe)
         extended = self._open.with_keyframe(keyframe)
@@ -251,6 +257,12 @@ class Engine:
         )
 
     # ------------------------------------------------------------------ what readers may ask
+
+    @property
+    def warnings(self) -> tuple[Event, ...]:
+        """What casts doubt on the whole map, as it stands now."""
+        doubt = self._plausibility.doubt
+        return () if doubt is None else (doubt,)
 
     def snapshot(self) -> Snapshot | None:
         """Return the state that readers may know; None before the first keyframe."""

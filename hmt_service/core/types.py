@@ -105,6 +105,8 @@ class EventKind(StrEnum):
     INPUT_DROPPED = "input_dropped"
     LOST = "lost"
     PROCESS_FAILED = "process_failed"
+    PRESET_DOUBTED = "preset_doubted"
+    PRESET_CONFIRMED = "preset_confirmed"
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,6 +23,8 @@ class EventKind(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     EVENT_KIND_INPUT_DROPPED: _ClassVar[EventKind]
     EVENT_KIND_LOST: _ClassVar[EventKind]
     EVENT_KIND_PROCESS_FAILED: _ClassVar[EventKind]
+    EVENT_KIND_PRESET_DOUBTED: _ClassVar[EventKind]
+    EVENT_KIND_PRESET_CONFIRMED: _ClassVar[EventKind]
 
 class DaemonState(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
@@ -50,6 +52,8 @@ EVENT_KIND_ACCEPTED: EventKind
 EVENT_KIND_INPUT_DROPPED: EventKind
 EVENT_KIND_LOST: EventKind
 EVENT_KIND_PROCESS_FAILED: EventKind
+EVENT_KIND_PRESET_DOUBTED: EventKind
+EVENT_KIND_PRESET_CONFIRMED: EventKind
 DAEMON_STATE_UNSPECIFIED: DaemonState
 DAEMON_STATE_STARTING: DaemonState
 DAEMON_STATE_RUNNING: DaemonState
