@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from hmt_service.core.config import Config
     from hmt_service.core.engine import Engine
-    from hmt_service.core.types import Reading
+    from hmt_service.core.types import Event, Reading
     from hmt_service.runtime.messages import RunReport
 
 
@@ -66,7 +66,24 @@ def _map(
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), Remaining())
     with Progress(*columns, console=console) as progress:
         task = progress.add_task("mapping", total=scans)
-        return map_readings(readings, settings, seed=seed, on_scan=lambda: progress.advance(task))
+        return map_readings(
+            readings,
+            settings,
+            seed=seed,
+            on_scan=lambda: progress.advance(task),
+            on_event=lambda event: _warn(console, event),
+        )
+
+
+def _warn(console: Console, event: Event) -> None:
+    """Print an event when it says something of the settings."""
+    from hmt_service.core.types import EventKind
+
+    if event.kind is EventKind.PRESET_DOUBTED:
+        text = f"warning: {event.message}"
+        console.print(text, style="yellow", soft_wrap=True, markup=False, highlight=False)
+    elif event.kind is EventKind.PRESET_CONFIRMED:
+        console.print(event.message, soft_wrap=True, markup=False)
 
 
 def _report_map(console: Console, engine: Engine, report: RunReport) -> None:

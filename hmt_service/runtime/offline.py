@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable
 from hmt_service.core.config import Config
 from hmt_service.core.engine import Engine
 from hmt_service.core.odometry import Odometry
-from hmt_service.core.types import Reading
+from hmt_service.core.types import Event, Reading
 from hmt_service.runtime.messages import RunReport
 
 
@@ -22,6 +22,7 @@ def map_readings(
     *,
     seed: int = 0,
     on_scan: Callable[[], object] = lambda: None,
+    on_event: Callable[[Event], object] = lambda _: None,
 ) -> tuple[Engine, RunReport]:
     """Return the finished engine, and what it has cost.
 
@@ -30,6 +31,7 @@ def map_readings(
         config: Settings of all stages.
         seed: Seed of all randomness.
         on_scan: Called after each scan.
+        on_event: Called with everything that happens to the map, before `on_scan`.
     """
     odometry, engine = Odometry(config), Engine(config, seed=seed)
     scans, odometry_busy_s, topology_busy_s = 0, 0.0, 0.0
@@ -40,11 +42,15 @@ def map_readings(
         odometry_busy_s += tracked_s - started_s
         if tracking is None:
             continue
-        engine.process(tracking)
+        events = engine.process(tracking)
         topology_busy_s += time.perf_counter() - tracked_s
         scans += 1
+        for event in events:
+            on_event(event)
         on_scan()
     started_s = time.perf_counter()
-    engine.finish()
+    events = engine.finish()
     topology_busy_s += time.perf_counter() - started_s
+    for event in events:
+        on_event(event)
     return engine, RunReport(scans, odometry_busy_s, topology_busy_s)

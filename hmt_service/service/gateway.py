@@ -165,7 +165,8 @@ class Gateway:
     def publish(self, events: Iterable[Event]) -> None:
         """Keep, log and publish events."""
         for event in events:
-            _LOG.info("%s: %s", event.kind, event.message)
+            level = logging.WARNING if event.kind is EventKind.PRESET_DOUBTED else logging.INFO
+            _LOG.log(level, "%s: %s", event.kind, event.message)
             self._events.append(event)
             self._put(Topic.EVENT, event)
 

@@ -86,6 +86,21 @@ def test_summary_and_map_file_agree(log: Path, tmp_path: Path) -> None:
     assert summary["peak_memory_mb"] > 10.0
 
 
+def test_a_wrong_preset_is_a_warning_with_numbers_and_no_error(log: Path, tmp_path: Path) -> None:
+    result = run(log, tmp_path, "--preset", "3d-indoor")
+    assert result.exit_code == 0
+    (warning,) = json.loads((tmp_path / "summary.json").read_text())["warnings"]
+    assert "of one plane through the sensor: 2d would fit better" in warning
+    assert [line for line in result.stderr.splitlines() if "warning: " in line] == [
+        f"warning: {warning}"
+    ]
+
+
+def test_the_right_preset_gives_no_warning(log: Path, tmp_path: Path) -> None:
+    assert "warning" not in run(log, tmp_path).stderr
+    assert json.loads((tmp_path / "summary.json").read_text())["warnings"] == []
+
+
 def test_settings_change_the_map_and_its_hash(log: Path, tmp_path: Path) -> None:
     settings = tmp_path / "settings.yaml"
     settings.write_text("odometry: {keyframe_distance_m: 1.0}")

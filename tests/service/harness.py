@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+from hmt_service.core.config import Preset
 from hmt_service.errors import Unavailable
 from hmt_service.service.client import HmtClient
 from hmt_service.service.reports import DaemonState
@@ -53,7 +54,11 @@ class RunningDaemon:
 
 @contextmanager
 def running_daemon(
-    out: Path, *, router: str | None = None, is_awaited: bool = True
+    out: Path,
+    *,
+    router: str | None = None,
+    is_awaited: bool = True,
+    preset: Preset = Preset.PLANAR,
 ) -> Iterator[RunningDaemon]:
     """Run a daemon that is killed at the end.
 
@@ -61,11 +66,12 @@ def running_daemon(
         out: Folder to save to.
         router: Endpoint of a router to reach it through, instead of its own.
         is_awaited: Whether it shall be ready for work.
+        preset: Kind of sensor that it expects.
     """
     endpoint = router or free_endpoint()
     settings = out.parent / "settings.yaml"
     settings.write_text(SETTINGS)
-    command = [sys.executable, "-m", "hmt_service", "serve"]
+    command = [sys.executable, "-m", "hmt_service", "serve", "--preset", preset]
     meeting = ["--connect", router] if router else ["--listen", endpoint]
     with subprocess.Popen(
         [*command, *meeting, "--config", str(settings), "--out", str(out)],

@@ -18,7 +18,8 @@ from typer.testing import CliRunner
 
 from hmt_service.cli.app import app
 from hmt_service.cli.serve import PROCESS_FAILED
-from hmt_service.core.types import Event
+from hmt_service.core.config import Preset
+from hmt_service.core.types import Event, EventKind
 from hmt_service.errors import DaemonFailure, HmtError, Unavailable
 from hmt_service.io.trajectory import read_tum
 from hmt_service.runtime.messages import ProcessName
@@ -169,6 +170,29 @@ def recorded_events(daemon: RunningDaemon) -> Iterator[list[Event]]:
         # The subscription is known to the daemon when this later message has come back.
         list(session.get(Keys("site", "robot").call(Call.STATUS)))
         yield events
+
+
+def test_a_wrong_preset_is_doubted_in_the_log_on_the_wire_and_in_the_summary(
+    tmp_path: Path,
+) -> None:
+    scans = 400  # 40 m with a keyframe per metre: twice what the first verdict takes
+    with (
+        running_daemon(tmp_path / "out", preset=Preset.INDOOR) as daemon,
+        daemon.client() as client,
+        recorded_events(daemon) as published,
+    ):
+        publish(client, scans)
+        client.finish()
+        (kept,) = [e for e in client.events() if e.kind is EventKind.PRESET_DOUBTED]
+        wait_until(lambda: kept in published)
+        daemon.process.terminate()
+        output = daemon.output()
+    assert daemon.process.returncode == 0
+    assert [e for e in published if e.kind is EventKind.PRESET_DOUBTED] == [kept]
+    assert kept.message.startswith("preset 3d-indoor expects heights")
+    assert kept.numbers["keyframes"] == 20.0
+    assert output.count("WARNING preset_doubted: preset 3d-indoor expects") == 1
+    assert json.loads((daemon.out / "summary.json").read_text())["warnings"] == [kept.message]
 
 
 def test_children_end_when_the_parent_is_killed(tmp_path: Path) -> None:
