@@ -1,5 +1,7 @@
 """Accuracy of the map: recorded logs by relations, simulated worlds by their true trajectory.
 
+The odometry alone, beside KISS-ICP, is measured by `benchmarks.metric_level`.
+
 References:
     Kümmerle et al., On measuring the accuracy of SLAM algorithms, Autonomous Robots 27, 2009.
 """
@@ -18,6 +20,7 @@ from pathlib import Path
 import numpy as np
 from pydantic import TypeAdapter
 
+from benchmarks import metric_level
 from benchmarks.cells import Result
 from benchmarks.metric import Direction, Metric
 from benchmarks.recordings import Missing, first_scans, read_recorded, recorded_file
@@ -64,9 +67,9 @@ _LOWER, _HIGHER = Direction.LOWER_IS_BETTER, Direction.HIGHER_IS_BETTER
 
 
 def measure(run: Run) -> Report:
-    """Map every recorded log that is there, and some worlds of every family."""
+    """Map every recorded log that is there and some worlds of every family, then only track."""
     reports = [_measure_recorded(run, name) for name in _LOGS]
-    reports.append(measure_simulated(run))
+    reports += [measure_simulated(run), metric_level.measure(run)]
     return Report(
         tuple(metric for report in reports for metric in report.metrics),
         tuple(sentence for report in reports for sentence in report.skipped),
