@@ -19,8 +19,9 @@ from hmt_service.core.config import Preset, SensorConfig, load_config
 from hmt_service.core.geometry import FloatArray
 from hmt_service.core.types import Event, EventKind, Keyframe
 
-_FIRST_LOOK = 20
-"""Keyframes before the first verdict; the next ones at twice as many each, so that it is calm."""
+_FIRST_LOOK = 40
+"""Keyframes before the first verdict: many a drive starts in a corner (measured: one in the open
+looks like a building for 20). The next ones come at twice as many each, so that it is calm."""
 _CELL_M = 1.0
 _BIN_M = 0.1
 
@@ -63,7 +64,7 @@ class Plausibility:
         self._heights = _Histogram(sensor.max_range_m)
         self._keyframes = 0
         self._next_look = _FIRST_LOOK
-        self._said: frozenset[_Contradiction] = frozenset()
+        self._said: tuple[Preset, ...] | None = None
         self._doubt: Event | None = None
 
     @property
@@ -92,17 +93,19 @@ class Plausibility:
             self._heights.quantile(0.95),
         )
         found = _contradictions(seen, self._sensor)
-        if found == self._said:
+        verdict = _fitting(seen) if found else None
+        if verdict == self._said:
             return ()
-        self._said = found
+        self._said = verdict
         numbers = {**asdict(seen), **_expected(self._sensor)}
         name = _name(self._sensor)
-        if not found:
+        if verdict is None:
             self._doubt = None
             message = f"{name} fits after all: {seen}"
             return (Event(EventKind.PRESET_CONFIRMED, stamp_s, message, numbers),)
-        expectations = " and ".join(_expectation(each, self._sensor) for each in _ordered(found))
-        message = f"{name} expects {expectations}; {seen}: {_advice(seen)}"
+        expectations = " and ".join(_expectation(each, self._sensor) for each in found)
+        advice = f"{' or '.join(verdict)} would fit better" if verdict else "no preset fits"
+        message = f"{name} expects {expectations}; {seen}: {advice}"
         self._doubt = Event(EventKind.PRESET_DOUBTED, stamp_s, message, numbers)
         return (self._doubt,)
 
@@ -139,15 +142,15 @@ def _heights(rays: FloatArray) -> FloatArray:
     return np.asarray(np.abs(rays @ axes[:, 0]))
 
 
-def _contradictions(seen: _Seen, sensor: SensorConfig) -> frozenset[_Contradiction]:
+def _contradictions(seen: _Seen, sensor: SensorConfig) -> tuple[_Contradiction, ...]:
     is_flat = seen.height_95_m <= sensor.flat_height_m
     holds = {
-        _Contradiction.FLAT: is_flat and not sensor.is_planar,
-        _Contradiction.NOT_FLAT: sensor.is_planar and not is_flat,
         _Contradiction.TOO_NEAR: seen.median_range_m < sensor.min_median_range_m,
         _Contradiction.TOO_FAR: seen.median_range_m > sensor.max_median_range_m,
+        _Contradiction.FLAT: is_flat and not sensor.is_planar,
+        _Contradiction.NOT_FLAT: sensor.is_planar and not is_flat,
     }
-    return frozenset(contradiction for contradiction, is_so in holds.items() if is_so)
+    return tuple(contradiction for contradiction, is_so in holds.items() if is_so)
 
 
 def _expectation(contradiction: _Contradiction, sensor: SensorConfig) -> str:
@@ -162,9 +165,8 @@ def _expectation(contradiction: _Contradiction, sensor: SensorConfig) -> str:
             return f"a median range of at most {sensor.max_median_range_m:g} m"
 
 
-def _advice(seen: _Seen) -> str:
-    fitting = [p for p in Preset if not _contradictions(seen, load_config(p).sensor)]
-    return f"{' or '.join(fitting)} would fit better" if fitting else "no preset fits"
+def _fitting(seen: _Seen) -> tuple[Preset, ...]:
+    return tuple(p for p in Preset if not _contradictions(seen, load_config(p).sensor))
 
 
 def _name(sensor: SensorConfig) -> str:
@@ -183,10 +185,6 @@ def _expected(sensor: SensorConfig) -> Mapping[str, float]:
         "max_median_range_m": sensor.max_median_range_m,
         "flat_height_m": sensor.flat_height_m,
     }
-
-
-def _ordered(found: frozenset[_Contradiction]) -> list[_Contradiction]:
-    return [contradiction for contradiction in _Contradiction if contradiction in found]
 
 
 _CELL_NUMBER = np.array([1, 1 << 21, 1 << 42])

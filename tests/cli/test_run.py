@@ -87,7 +87,9 @@ def test_summary_and_map_file_agree(log: Path, tmp_path: Path) -> None:
 
 
 def test_a_wrong_preset_is_a_warning_with_numbers_and_no_error(log: Path, tmp_path: Path) -> None:
-    result = run(log, tmp_path, "--preset", "3d-indoor")
+    settings = tmp_path / "settings.yaml"
+    settings.write_text("odometry: {keyframe_distance_m: 0.4}")  # enough for a verdict
+    result = run(log, tmp_path, "--preset", "3d-indoor", "--config", str(settings))
     assert result.exit_code == 0
     (warning,) = json.loads((tmp_path / "summary.json").read_text())["warnings"]
     assert "of one plane through the sensor: 2d would fit better" in warning

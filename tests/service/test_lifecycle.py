@@ -175,7 +175,7 @@ def recorded_events(daemon: RunningDaemon) -> Iterator[list[Event]]:
 def test_a_wrong_preset_is_doubted_in_the_log_on_the_wire_and_in_the_summary(
     tmp_path: Path,
 ) -> None:
-    scans = 400  # 40 m with a keyframe per metre: twice what the first verdict takes
+    scans = 600  # 60 m with a keyframe per metre; the first verdict takes 40
     with (
         running_daemon(tmp_path / "out", preset=Preset.INDOOR) as daemon,
         daemon.client() as client,
@@ -190,7 +190,7 @@ def test_a_wrong_preset_is_doubted_in_the_log_on_the_wire_and_in_the_summary(
     assert daemon.process.returncode == 0
     assert [e for e in published if e.kind is EventKind.PRESET_DOUBTED] == [kept]
     assert kept.message.startswith("preset 3d-indoor expects heights")
-    assert kept.numbers["keyframes"] == 20.0
+    assert kept.numbers["keyframes"] == 40.0
     assert output.count("WARNING preset_doubted: preset 3d-indoor expects") == 1
     assert json.loads((daemon.out / "summary.json").read_text())["warnings"] == [kept.message]
 
