@@ -1,18 +1,22 @@
 """Resident memory of a process that does nothing but odometry, over the time of the robot.
 
 The process gets one reading at a time through a pipe and answers with its memory, so that neither
-what makes the readings nor a log of them counts: what grows is the odometry.
+what makes the readings nor a log of them counts: what grows is the odometry. It is a program of its
+own, so that what its caller has loaded does not count either.
 
 References: own.
 """
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
-from multiprocessing import get_context
+from multiprocessing import Pipe
 from multiprocessing.connection import Connection
+from pathlib import Path
 
 import numpy as np
 import psutil
@@ -24,6 +28,7 @@ from hmt_service.core.odometry import Odometry
 from hmt_service.core.types import Reading, Scan
 from hmt_service.errors import InvalidInput
 
+_ROOT = Path(__file__).parents[1]
 # A median over so long: an allocator keeps a page more or less for a moment.
 _WINDOW_S = 10.0
 _STOP_S = 5.0
@@ -64,21 +69,20 @@ def resident_memory(
     Raises:
         ChildFailed: If the process ends before the readings do.
     """
-    context = get_context("spawn")
-    here, there = context.Pipe()
-    process = context.Process(target=_answer, args=(there, config), daemon=True)
-    process.start()
-    there.close()
-    try:
-        samples = list(_samples(here, readings, until_s))
-    except (EOFError, OSError) as error:
-        process.join(_STOP_S)
-        raise ChildFailed(f"the odometry ended with code {process.exitcode}") from error
-    finally:
-        here.close()
-        process.join(_STOP_S)
-        process.kill()
-        process.join()
+    here, there = Pipe()
+    with here, there:
+        command = [sys.executable, "-m", __name__, str(there.fileno())]
+        process = subprocess.Popen(command, pass_fds=[there.fileno()], cwd=_ROOT)
+        try:
+            there.close()
+            here.send(config)
+            samples = list(_samples(here, readings, until_s))
+        except (EOFError, OSError) as error:
+            code = process.wait(_STOP_S)
+            raise ChildFailed(f"the odometry ended with code {code}") from error
+        finally:
+            process.kill()
+            process.wait()
     stamps_s, rss_bytes = np.array(samples).T
     return ResidentMemory(stamps_s, rss_bytes)
 
@@ -99,10 +103,15 @@ def _samples(
             return
 
 
-def _answer(connection: Connection, config: Config) -> None:
-    """Track what comes through the pipe, and say how much memory there is; runs by itself."""
-    odometry, process = Odometry(config), psutil.Process()
-    with suppress(EOFError, BrokenPipeError):  # nobody is interested any more
+def _main(descriptor: str) -> None:
+    """Track what comes through the pipe, and say how much memory there is."""
+    process = psutil.Process()
+    with Connection(int(descriptor)) as connection, suppress(EOFError, BrokenPipeError):
+        odometry = Odometry(connection.recv())
         while True:
             odometry.process(connection.recv())
             connection.send(process.memory_info().rss)
+
+
+if __name__ == "__main__":
+    _main(*sys.argv[1:])

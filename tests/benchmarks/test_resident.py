@@ -26,7 +26,7 @@ def test_memory_is_told_after_every_scan_until_the_time_is_over() -> None:
     np.testing.assert_allclose(memory.stamps_s, np.arange(21) * 0.2)
     assert memory.rss_bytes.shape == (21,)
     # An interpreter with numpy and scipy, at least; no log.
-    assert 30e6 < memory.rss_bytes.min() <= memory.rss_bytes.max() < 1e9
+    assert 30e6 < memory.rss_bytes.min() <= memory.rss_bytes.max() < 200e6
 
 
 def test_memory_at_a_time_is_the_median_of_the_ten_seconds_before() -> None:
@@ -40,7 +40,6 @@ def test_there_is_no_memory_after_the_last_scan() -> None:
         ResidentMemory(np.arange(10.0), np.arange(10.0)).at(10.0)
 
 
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
 def test_a_process_that_ends_is_a_failure(capfd: pytest.CaptureFixture[str]) -> None:
     broken = OdometryReading(0.0, np.zeros(3))
     with pytest.raises(ChildFailed, match="the odometry ended with code 1"):
