@@ -27,6 +27,7 @@ from hmt_service.core.geometry import (
     transform_points,
 )
 from hmt_service.core.registration import RegistrationMap, voxel_downsample
+from hmt_service.core.transients import without_transients
 from hmt_service.core.types import Keyframe, Points
 
 
@@ -60,11 +61,9 @@ class Visit:
 
     @cached_property
     def points(self) -> FloatArray:
-        """Submap: all points in the visit's frame, one per voxel, shape (N, 3), m."""
-        clouds = [
-            transform_points(pose.mean, keyframe.points_in_body)
-            for pose, keyframe in zip(self.visit_from_keyframe, self.keyframes, strict=True)
-        ]
+        """Submap: what stood still, in the visit's frame, one point per voxel, shape (N, 3), m."""
+        poses = [pose.mean for pose in self.visit_from_keyframe]
+        clouds = without_transients(self.keyframes, poses, self.config)
         return voxel_downsample(np.concatenate(clouds), 0.5 * self.config.odometry.voxel_size_m)
 
     @cached_property
