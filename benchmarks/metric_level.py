@@ -29,12 +29,12 @@ from benchmarks.chain import write_readings
 from benchmarks.kitti import read_kitti
 from benchmarks.metric import Direction, Metric
 from benchmarks.recordings import Missing, first_scans, read_recorded, recorded_file
+from benchmarks.relative_motion import motion_errors
 from benchmarks.report import Report, Run
 from benchmarks.resident import resident_memory
 from benchmarks.short_steps import StepErrors, step_errors
 from benchmarks.simulated import readings_of
 from benchmarks.tracking import Program, TrackingRun, run_tracker
-from benchmarks.trajectories import trajectory_errors
 from hmt_service.core.config import Preset, load_config
 from hmt_service.core.geometry import FloatArray, exp, log
 from hmt_service.core.types import OdometryReading, StampedPose
@@ -78,7 +78,7 @@ _DRIVES = {
     "campus-64": _Drive(Family.CAMPUS, 0, LIDAR_64, 300),
     "office": _Drive(Family.OFFICE, 0, LIDAR, 600),
 }
-# Its robot turns a corner within these scans: errors along a line could not be told.
+# Its robot turns a corner within these scans.
 _QUICK_DRIVES = {"garage": _Drive(Family.GARAGE, 2, LIDAR, 60)}
 _KITTI = "kitti00_part"
 _FAST = "garage-64"
@@ -180,10 +180,10 @@ def _compare(preset: Preset, source: Source, *, has_odometry: bool = True) -> Re
 
 def _side(run: TrackingRun, truth: Sequence[StampedPose]) -> dict[str, float]:
     moments_s = np.array([pose.stamp_s for pose in run.trajectory])
-    errors = trajectory_errors(run.trajectory, poses_at(truth, moments_s))
+    errors = motion_errors(run.trajectory, poses_at(truth, moments_s))
     return {
-        "relative_10m": errors.relative_m,
-        "relative_10m_rotation": errors.relative_deg,
+        "relative_10m": errors.translation_m,
+        "relative_10m_rotation": errors.rotation_deg,
         "cpu_per_scan": 1e3 / run.speed_hz,
         "failures": float(run.failures),
     }
