@@ -36,11 +36,13 @@ def test_two_percent_are_twenty_centimetres_over_ten_metres() -> None:
     assert motion_errors(line(scale=1.02), line()).translation_m == pytest.approx(expected_m)
 
 
-def test_one_turn_is_in_a_third_of_all_stretches() -> None:
+def test_a_turn_shows_in_the_stretches_across_it_and_the_way_askew_after_it() -> None:
     errors = motion_errors(line(turn_rad=math.radians(6.0)), line())
     # Of the 62 stretches, those that begin at step 21 to 40.
     assert errors.rotation_deg == pytest.approx(6.0 * 20 / 62, rel=1e-6)
-    assert errors.translation_m == pytest.approx(0.0, abs=1e-9)
+    # Those that begin later, 20 of 10 m and one of 9.5 m, are driven askew.
+    askew = 2.0 * math.sin(math.radians(3.0))
+    assert errors.translation_m == pytest.approx(askew * (20 * 10.0 + 9.5) / 62, rel=1e-6)
 
 
 def test_a_path_that_is_too_short_cannot_be_judged() -> None:
