@@ -29,8 +29,8 @@ from hmt_service.core.types import Reading, Scan
 from hmt_service.errors import InvalidInput
 
 _ROOT = Path(__file__).parents[1]
-# A median over so long: an allocator keeps a page more or less for a moment.
-_WINDOW_S = 10.0
+# A median over so long: a local map is larger in one place than in another.
+_WINDOW_S = 60.0
 _STOP_S = 5.0
 
 
@@ -44,7 +44,7 @@ class ResidentMemory:
     """Resident memory after each, shape (N,)."""
 
     def at(self, elapsed_s: float) -> float:
-        """Return the median memory over the 10 s up to some time since the first scan, in bytes.
+        """Return the median memory over the minute up to some time since the first scan, in bytes.
 
         Raises:
             InvalidInput: If the scans end before.
