@@ -9,7 +9,8 @@ RUN apt-get update \
 WORKDIR /opt/hmt
 COPY pyproject.toml constraints.txt README.md LICENSE ./
 COPY hmt_service ./hmt_service
-RUN pip install --no-cache-dir -c constraints.txt .
+RUN pip install --no-cache-dir -c constraints.txt . \
+    && cd / && python -c 'from hmt_service.core import local_map; local_map.compile_all_kernels()'
 
 RUN useradd --create-home --uid 1000 hmt \
     && install --directory --owner hmt --group hmt /data

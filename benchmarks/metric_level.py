@@ -24,6 +24,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks import honesty
 from benchmarks.cells import Result
 from benchmarks.chain import write_readings
 from benchmarks.kitti import read_kitti
@@ -110,7 +111,12 @@ _COMPARED = {
 
 def measure(run: Run) -> Report:
     """Measure the metric level on everything that is there."""
-    reports = (_measure_lidar(run), _measure_steps(run), _measure_memory(run))
+    reports = (
+        _measure_lidar(run),
+        _measure_steps(run),
+        honesty.measure(run),
+        _measure_memory(run),
+    )
     return Report(
         tuple(metric for report in reports for metric in report.metrics),
         tuple(sentence for report in reports for sentence in report.skipped),

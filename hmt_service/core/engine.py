@@ -10,6 +10,7 @@ References:
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -46,6 +47,7 @@ from hmt_service.core.types import (
     PlacedArea,
     Points,
     Posterior,
+    Registration,
     Snapshot,
     StampedPose,
     Tracking,
@@ -80,6 +82,7 @@ class Engine:
         self._visits: dict[int, Visit] = {}
         self._motions: list[Factor] = []
         self._scans: list[StoredScan] = []
+        self._tracked: Counter[str] = Counter()
         self._weighed: dict[int, dict[int, float]] = {}
         self._next_hypothesis = 0
         self._revision = 0
@@ -98,21 +101,23 @@ class Engine:
         """
         pose = tracking.keyframe_from_body.mean
         self._scans.append(StoredScan(tracking.stamp_s, tracking.keyframe_index, pose))
+        self._tracked.update(_said_of(tracking))
         keyframe = tracking.keyframe
         if keyframe is None:
             return ()
         self._revision += 1
         self._observation.learn(keyframe)
-        return (*self._plausibility.check(keyframe), *self._map(keyframe))
+        return (*self._plausibility.check(keyframe), *self._map(keyframe, tracking.registration))
 
-    def _map(self, keyframe: Keyframe) -> tuple[Event, ...]:
+    def _map(self, keyframe: Keyframe, registration: Registration | None) -> tuple[Event, ...]:
         """Add a keyframe to every hypothesis."""
         if not self._visits:
             return self._begin(keyframe)
         extended = self._open.with_keyframe(keyframe)
         if keyframe.failure is not None:
             first_of_new = len(self._open.keyframes)
-            return (_lost(keyframe, keyframe.failure), *self._enter(extended, first_of_new))
+            lost = _lost(keyframe, keyframe.failure, registration)
+            return (lost, *self._enter(extended, first_of_new))
         self._visits[extended.visit] = extended  # metric SLAM
         events = self._weigh(keyframe)  # Eq. (12)
         border = self._border(extended)  # AAM
@@ -263,6 +268,15 @@ class Engine:
         """What casts doubt on the whole map, as it stands now."""
         doubt = self._plausibility.doubt
         return () if doubt is None else (doubt,)
+
+    @property
+    def tracked(self) -> Mapping[str, int]:
+        """Number of scans that were registered or were not, by the reason.
+
+        Of those that were, how many left a direction to the prediction (`degenerate`), and how many
+        contradicted it (`contradicted`).
+        """
+        return dict(sorted(self._tracked.items()))
 
     def snapshot(self) -> Snapshot | None:
         """Return the state that readers may know; None before the first keyframe."""
@@ -448,12 +462,25 @@ _ANY_CUT = 2.0
 _NO_POINTS: Points = np.zeros((0, 3), dtype=np.float32)
 
 
-def _lost(keyframe: Keyframe, failure: TrackingFailure) -> Event:
+def _said_of(tracking: Tracking) -> list[str]:
+    """Return what is counted of a scan."""
+    registration = tracking.registration
+    said = ["registered" if tracking.failure is None else str(tracking.failure)]
+    if registration is not None and tracking.failure is None:
+        said += ["degenerate"] if len(registration.degenerate) else []
+        said += ["contradicted"] if registration.prior_weight < 1.0 else []
+    return said
+
+
+def _lost(keyframe: Keyframe, failure: TrackingFailure, registration: Registration | None) -> Event:
     numbers = {
         "keyframe": float(keyframe.index),
         "sigma_m": keyframe.previous_from_body.sigma_m,
         "sigma_rad": keyframe.previous_from_body.sigma_rad,
     }
+    if registration is not None:
+        numbers["inlier_share"] = registration.inlier_share
+        numbers["correction_m"] = registration.correction_m
     message = f"keyframe {keyframe.index} was not registered ({failure}): a new area begins"
     return Event(EventKind.LOST, keyframe.stamp_s, message, numbers)
 

@@ -116,16 +116,18 @@ def quaternion_of(pose: FloatArray) -> FloatArray:
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = np.moveaxis(pose[..., :3, :3], (-2, -1), (0, 1))
     trace = xx + yy + zz
     # Shepperd's method: of four equal formulae, take the one that divides by the largest component.
-    formulae = np.stack(
-        [
-            np.stack([1.0 - trace + 2.0 * xx, yx + xy, zx + xz, zy - yz], axis=-1),
-            np.stack([yx + xy, 1.0 - trace + 2.0 * yy, zy + yz, xz - zx], axis=-1),
-            np.stack([zx + xz, zy + yz, 1.0 - trace + 2.0 * zz, yx - xy], axis=-1),
-            np.stack([zy - yz, xz - zx, yx - xy, 1.0 + trace], axis=-1),
-        ],
-        axis=-2,
-    )
-    largest = np.argmax(np.stack([xx, yy, zz, trace], axis=-1), axis=-1)
+    formulae = np.empty((*trace.shape, 4, 4))
+    formulae[..., 0, 0] = 1.0 - trace + 2.0 * xx
+    formulae[..., 1, 1] = 1.0 - trace + 2.0 * yy
+    formulae[..., 2, 2] = 1.0 - trace + 2.0 * zz
+    formulae[..., 3, 3] = 1.0 + trace
+    formulae[..., 0, 1] = formulae[..., 1, 0] = yx + xy
+    formulae[..., 0, 2] = formulae[..., 2, 0] = zx + xz
+    formulae[..., 0, 3] = formulae[..., 3, 0] = zy - yz
+    formulae[..., 1, 2] = formulae[..., 2, 1] = zy + yz
+    formulae[..., 1, 3] = formulae[..., 3, 1] = xz - zx
+    formulae[..., 2, 3] = formulae[..., 3, 2] = yx - xy
+    largest = np.argmax(np.diagonal(formulae, axis1=-2, axis2=-1), axis=-1)
     q = np.take_along_axis(formulae, largest[..., None, None], axis=-2)[..., 0, :]
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)
     return np.asarray(np.where(q[..., 3:] >= 0.0, q, -q))

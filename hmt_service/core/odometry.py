@@ -1,7 +1,7 @@
 """Metric level: ties each scan to the keyframes before it and picks the next keyframe.
 
 References:
-    Vizzo et al., KISS-ICP, RA-L 2023 (registration against a local voxel map).
+    Vizzo et al., KISS-ICP, RA-L 2023 (registration against a short local map).
     Blanco et al. 2008, section V ("metric SLAM" process).
 """
 
@@ -28,23 +28,28 @@ from hmt_service.core.geometry import (
     symmetric,
     transform_points,
 )
-from hmt_service.core.registration import RegistrationMap, covariance_of, deskew, voxel_downsample
+from hmt_service.core.local_map import Fit, LocalMap, SeenPoints, Sweep, compile_kernels
+from hmt_service.core.surfels import thin
 from hmt_service.core.types import (
     Keyframe,
     OdometryReading,
     Reading,
+    Registration,
     Scan,
     Tracking,
     TrackingFailure,
 )
 
-# chi-square 99.9 % for 3 and 6 degrees of freedom: beyond it, odometry and scan contradict.
-_GATE = {3: 16.27, 6: 22.46}
 # Of a heading that may be anything, and of a position that nothing but speed bounds.
 _LOST_RAD = np.pi / np.sqrt(3.0)
 _LOST_M = 100.0
 # Two stamps of one moment may differ by this much.
 _STAMP_SLACK_S = 1.0
+# Sizes of cells, over those of the local map: of what a keyframe keeps of a LiDAR's points, and of
+# what is registered of these.
+_KEPT_CELLS, _REGISTERED_CELLS = 0.5, 1.5
+# New space makes a keyframe after this share of the usual motion: never while standing still.
+_LEAST_MOTION_SHARE = 0.2
 
 
 class Odometry:
@@ -65,20 +70,24 @@ class Odometry:
         self._motion = config.motion
         self._covariance = config.covariance
         self._axes = PLANAR_AXES if config.sensor.is_planar else np.arange(6)
-        self._window: deque[tuple[Pose, FloatArray]] = deque(
+        self._window: deque[tuple[Pose, SeenPoints]] = deque(
             maxlen=config.odometry.window_keyframes
         )
-        self._map: RegistrationMap | None = None
+        self._map: LocalMap | None = None
         self._keyframes = 0
         self._keyframe_from_body = certain(identity())
+        self._keyframe_error = np.zeros((6, 6))
         self._last_motion = identity()
+        self._last_sweep_motion: FloatArray | None = None
         self._last_stamp_s: float | None = None
         self._odometry: OdometryReading | None = None
         self._odometry_at_scan: OdometryReading | None = None
         self._motion_since_odometry = identity()
         self._last_elapsed_s = 0.0
+        self._sweep_s = np.inf
         self._registered_s = 0.0
         self._failures = 0
+        compile_kernels(is_planar=config.sensor.is_planar)
 
     def process(self, reading: Reading) -> Tracking | None:
         """Take one reading in time order.
@@ -95,7 +104,7 @@ class Odometry:
                 self._odometry_at_scan = None
             self._odometry = reading
             return None
-        return self._register(reading)
+        return self._track(reading)
 
     def _has_jumped(self, reading: OdometryReading) -> bool:
         before = self._odometry
@@ -105,76 +114,53 @@ class Odometry:
         allowed_s = max(reading.stamp_s - before.stamp_s, 0.0) + _STAMP_SLACK_S
         return bool(moved_m > self._motion.max_speed_m_s * allowed_s)
 
-    def _register(self, scan: Scan) -> Tracking:
+    def _track(self, scan: Scan) -> Tracking:
         if self._map is None or self._last_stamp_s is None:
             return self._begin(scan)
         elapsed_s = scan.stamp_s - self._last_stamp_s
-        predicted, motion = self._predict(elapsed_s)
-        points = self._points_of(scan, motion)
-        posed, failure = self._correct(scan, points, predicted)
-        self._last_motion = inverse(self._keyframe_from_body.mean) @ posed.mean
-        self._last_elapsed_s = elapsed_s
-        self._motion_since_odometry = (
-            identity()
-            if self._has_new_odometry
-            else self._motion_since_odometry @ self._last_motion
+        motion = self._predict(elapsed_s)
+        sweep, sweep_share = self._sweep_of(scan, elapsed_s)
+        expected = GaussianPose(
+            exp(sweep_share * log(motion.mean)), sweep_share * motion.covariance
         )
+        posed, fit, failure = self._register(
+            sweep, self._keyframe_from_body @ motion, expected, elapsed_s=elapsed_s
+        )
+        sweep_motion = log(expected.mean) if fit is None else fit.motion
+        error = self._error_of(sweep, sweep_motion, log(expected.mean))
+        registration = None if fit is None else self._registration(fit, motion)
+        self._remember_motion(posed.mean, elapsed_s, sweep_motion)
         self._failures = 0 if failure is None else self._failures + 1
-        if self._is_keyframe(posed.mean, points, failure):
+        # What is said of the pose holds what is wrong with the keyframe and with this scan.
+        told = GaussianPose(identity(), self._keyframe_error) @ posed
+        told = self._confined(GaussianPose(told.mean, told.covariance + error))
+        if self._is_keyframe(posed.mean, len(sweep.points), registration, failure):
             if failure is not None and not self._has_new_odometry:
-                posed = self._lost(posed.mean, scan.stamp_s - self._registered_s)
-            return self._add_keyframe(scan, points, posed, failure)
+                told = self._lost(told.mean, scan.stamp_s - self._registered_s)
+            return self._add_keyframe(
+                scan, sweep.at_end(sweep_motion), told, error, registration, failure
+            )
         self._keyframe_from_body = posed
         self._remember(scan, failure)
-        return Tracking(scan.stamp_s, self._keyframes - 1, posed, None, failure)
+        index = self._keyframes - 1
+        return Tracking(scan.stamp_s, index, told, None, failure, registration)
 
     def _begin(self, scan: Scan) -> Tracking:
-        points = self._points_of(scan)
+        sweep, _ = self._sweep_of(scan, np.inf)
         here = certain(identity())
-        if len(points) < self._config.min_points:
+        if len(sweep.points) < self._config.min_points:
             return Tracking(scan.stamp_s, 0, here, None, TrackingFailure.TOO_FEW_POINTS)
-        return self._add_keyframe(scan, points, here, None)
+        return self._add_keyframe(scan, sweep.points, here, np.zeros((6, 6)), None, None)
 
-    def _is_keyframe(
-        self, keyframe_from_body: Pose, points: FloatArray, failure: TrackingFailure | None
-    ) -> bool:
-        """Return whether the scan is kept: after motion, or to start anew when lost."""
-        config = self._config
-        if len(points) < config.min_points:
-            return False
-        if failure is not None:
-            # One bad scan is no reason to give the window up.
-            is_hopeless = failure is TrackingFailure.GAP_IN_TIME
-            return is_hopeless or self._failures >= config.max_failures
-        moved = log(keyframe_from_body)
-        return bool(
-            np.linalg.norm(moved[3:]) >= config.keyframe_distance_m
-            or np.linalg.norm(moved[:3]) >= config.keyframe_angle_rad
-        )
-
-    def _lost(self, mean: Pose, elapsed_s: float) -> GaussianPose:
-        """Return a pose that is bounded by the robot's speed only."""
-        sigma_m = min(self._motion.max_speed_m_s * elapsed_s, _LOST_M)
-        covariance = isotropic_covariance(sigma_rad=_LOST_RAD, sigma_m=sigma_m)
-        if self._sensor.is_planar:
-            covariance = planar_covariance(covariance)
-        return GaussianPose(mean, covariance)
-
-    def _points_of(self, scan: Scan, motion: Pose | None = None) -> FloatArray:
-        points = scan.points_in_body
-        if scan.point_times is not None and motion is not None and len(points):
-            points = deskew(points, scan.point_times, motion, self._sensor.max_range_m)
-        if self._sensor.is_planar or not len(points):
-            return points
-        return voxel_downsample(points, 0.5 * self._config.voxel_size_m)
+    # ------------------------------------------------------------------ what is expected
 
     @property
     def _has_new_odometry(self) -> bool:
         """Whether odometry has come since the scan before."""
         return self._odometry is not self._odometry_at_scan
 
-    def _predict(self, elapsed_s: float) -> tuple[GaussianPose, Pose]:
-        """Return the predicted pose in the last keyframe and the motion since the last scan."""
+    def _predict(self, elapsed_s: float) -> GaussianPose:
+        """Return the motion since the last scan: by the wheels, or as it was before."""
         now, before = self._odometry, self._odometry_at_scan
         if now is not None and before is not None and now is not before:
             measured = inverse(before.odom_from_body) @ now.odom_from_body
@@ -186,7 +172,7 @@ class Odometry:
             motion = measured = exp(times * log(self._last_motion))
             factor = self._motion.constant_velocity_factor
         if self._sensor.is_planar:
-            motion, measured = project_planar(motion), project_planar(measured)
+            motion = project_planar(motion)
         xi = log(measured)
         turned, travelled = float(np.linalg.norm(xi[:3])), float(np.linalg.norm(xi[3:]))
         noise = self._motion
@@ -199,82 +185,131 @@ class Odometry:
         sigma_rad = min(sigma_rad, _LOST_RAD)
         sigma_m = factor * (noise.sigma_floor_m * scans + noise.sigma_translation_share * travelled)
         covariance = isotropic_covariance(sigma_rad=sigma_rad, sigma_m=sigma_m)
-        if self._sensor.is_planar:
-            covariance = planar_covariance(covariance)
-        return self._keyframe_from_body @ GaussianPose(motion, covariance), motion
+        return self._confined(GaussianPose(motion, covariance))
 
-    def _correct(
-        self, scan: Scan, points: FloatArray, predicted: GaussianPose
-    ) -> tuple[GaussianPose, TrackingFailure | None]:
-        """Return the pose in the last keyframe after the scan has been seen."""
+    def _sweep_of(self, scan: Scan, elapsed_s: float) -> tuple[Sweep, float]:
+        """Return what is kept of a scan, and the share of the time since the last that it took."""
+        points, times = scan.points_in_body, scan.point_times
+        # Scans may be missing between two, but never is a sweep longer than from one to the next.
+        self._sweep_s = min(self._sweep_s, elapsed_s) if elapsed_s > 0.0 else self._sweep_s
+        is_timed = times is not None and np.isfinite(elapsed_s)
+        share = self._sweep_s / elapsed_s if is_timed and elapsed_s > 0.0 else 1.0
+        lags = np.zeros(len(points)) if times is None or not is_timed else 1.0 - times
+        if not self._sensor.is_planar and len(points):
+            kept = thin(points, _KEPT_CELLS * self._config.voxel_size_m)
+            points, lags = points[kept], lags[kept]
+        return Sweep(points, lags, scan.sensor_in_body), share
+
+    # ------------------------------------------------------------------ what the scan says
+
+    def _register(
+        self, sweep: Sweep, predicted: GaussianPose, motion: GaussianPose, *, elapsed_s: float
+    ) -> tuple[GaussianPose, Fit | None, TrackingFailure | None]:
+        """Return the pose in the last keyframe after the scan has been seen, and how it fits."""
         config = self._config
-        if self._map is None or self._last_stamp_s is None:
-            return predicted, None
         is_bridged = self._odometry_at_scan is not None and self._has_new_odometry
-        if scan.stamp_s - self._last_stamp_s > config.max_gap_s and not is_bridged:
-            return predicted, TrackingFailure.GAP_IN_TIME
-        if len(points) < config.min_points:
-            return predicted, TrackingFailure.TOO_FEW_POINTS
-        source = (
-            points
-            if self._sensor.is_planar
-            else voxel_downsample(points, 1.5 * self._config.voxel_size_m)
+        if elapsed_s > config.max_gap_s and not is_bridged:
+            return predicted, None, TrackingFailure.GAP_IN_TIME
+        if self._map is None or len(sweep.points) < config.min_points:
+            return predicted, None, TrackingFailure.TOO_FEW_POINTS
+        if not self._sensor.is_planar:
+            sweep = sweep.thinned(_REGISTERED_CELLS * config.voxel_size_m, config.max_points)
+        fit = self._map.register(sweep, predicted, motion, least_share=config.min_inlier_share)
+        failure = self._failure_of(fit, predicted)
+        if failure is not None:
+            return predicted, fit, failure
+        block = np.ix_(self._axes, self._axes)
+        together = fit.information + fit.prior_weight * _information(predicted, self._axes)
+        covariance = isotropic_covariance(
+            sigma_rad=self._covariance.floor_rad, sigma_m=self._covariance.floor_m
         )
-        pose = self._map.register(
-            source,
-            predicted.mean,
-            max_correspondence_m=config.max_correspondence_m,
-            kernel_m=config.kernel_m,
-        )
-        if pose is None:
-            return predicted, TrackingFailure.TOO_FEW_CORRESPONDENCES
-        correction = log(inverse(predicted.mean) @ pose)
+        covariance[block] += symmetric(np.linalg.inv(together[block]))
+        return self._confined(GaussianPose(fit.pose, covariance)), fit, None
+
+    def _failure_of(self, fit: Fit, predicted: GaussianPose) -> TrackingFailure | None:
+        config = self._config
+        if not fit.is_converged:
+            return TrackingFailure.NOT_CONVERGED
+        if fit.inlier_share < config.min_inlier_share:
+            return TrackingFailure.TOO_FEW_CORRESPONDENCES
+        correction = log(inverse(predicted.mean) @ fit.pose)
         if (
             np.linalg.norm(correction[3:]) > config.max_correction_m
             or np.linalg.norm(correction[:3]) > config.max_correction_rad
         ):
-            return predicted, TrackingFailure.CORRECTION_TOO_LARGE
-        match = self._map.match(source, pose, inlier_m=config.max_correspondence_m)
-        if match.inlier_share < config.min_inlier_share:
-            return predicted, TrackingFailure.TOO_FEW_CORRESPONDENCES
-        registered = covariance_of(
-            match.information, sigma_m=self._covariance.sigma_m, is_planar=self._sensor.is_planar
+            return TrackingFailure.CORRECTION_TOO_LARGE
+        return None
+
+    def _registration(self, fit: Fit, motion: GaussianPose) -> Registration:
+        correction = inverse(self._keyframe_from_body.mean @ motion.mean) @ fit.pose
+        return Registration(
+            inlier_share=fit.inlier_share,
+            known_share=fit.known_share,
+            prior_weight=fit.prior_weight,
+            correction_m=float(np.linalg.norm(correction[:3, 3])),
+            degenerate=fit.degenerate,
         )
-        return self._fuse(GaussianPose(pose, registered), predicted), None
 
-    def _fuse(self, registered: GaussianPose, predicted: GaussianPose) -> GaussianPose:
-        """Return the product of registration and motion prior, which is widened to agree.
+    def _error_of(self, sweep: Sweep, motion: FloatArray, predicted: FloatArray) -> FloatArray:
+        """Return the covariance of a pose because the motion during its sweep was not uniform.
 
-        The prior fills the directions that the scan does not see. Where it contradicts the scan
-        beyond the gate (wheel slip), it is widened until it no longer does, so that it loses its
-        say there and still bounds what nothing else does.
+        Turns begin and end within one sweep; speed changes from sweep to sweep. Where the turn is
+        not the one that was predicted, it may have happened at any time of the sweep.
         """
-        block = np.ix_(self._axes, self._axes)
-        gap = log(inverse(registered.mean) @ predicted.mean)[self._axes]
-        scan_covariance = registered.covariance[block] + self._floor()[block]
-        prior_covariance = predicted.covariance[block]
-        together = scan_covariance + prior_covariance
-        excess = float(gap @ np.linalg.solve(together, gap)) / _GATE[len(self._axes)]
-        if excess > 1.0:
-            prior_covariance = prior_covariance * excess
-            together = scan_covariance + prior_covariance
-        gain = np.linalg.solve(together, scan_covariance).T
-        step, covariance = np.zeros(6), np.zeros((6, 6))
-        step[self._axes] = gain @ gap
-        covariance[block] = symmetric(scan_covariance - gain @ scan_covariance)
-        if self._sensor.is_planar:
-            covariance = planar_covariance(covariance)
-        return GaussianPose(registered.mean @ exp(step), covariance)
+        if sweep.is_instant or self._last_sweep_motion is None:
+            return np.zeros((6, 6))
+        share, before = self._covariance.uneven_motion_share, self._last_sweep_motion
+        sigma = share * np.abs(motion - before)
+        turn = np.maximum(np.abs(motion), np.abs(before))[:3]
+        sigma[:3] = np.maximum(share * turn, 0.5 * np.abs(motion - predicted)[:3])
+        return np.diag(sigma**2)
 
-    def _floor(self) -> FloatArray:
-        floor = self._covariance
-        return isotropic_covariance(sigma_rad=floor.floor_rad, sigma_m=floor.floor_m)
+    def _confined(self, pose: GaussianPose) -> GaussianPose:
+        """Return the pose as uncertain as the robot can be: in the plane if it is planar."""
+        if not self._sensor.is_planar:
+            return GaussianPose(pose.mean, symmetric(pose.covariance))
+        return GaussianPose(pose.mean, planar_covariance(pose.covariance))
+
+    def _lost(self, mean: Pose, elapsed_s: float) -> GaussianPose:
+        """Return a pose that is bounded by the robot's speed only."""
+        sigma_m = min(self._motion.max_speed_m_s * elapsed_s, _LOST_M)
+        covariance = isotropic_covariance(sigma_rad=_LOST_RAD, sigma_m=sigma_m)
+        return self._confined(GaussianPose(mean, covariance))
+
+    # ------------------------------------------------------------------ what is kept
+
+    def _is_keyframe(
+        self,
+        keyframe_from_body: Pose,
+        points: int,
+        registration: Registration | None,
+        failure: TrackingFailure | None,
+    ) -> bool:
+        """Return whether the scan is kept: after motion, of new space, or to start anew."""
+        config = self._config
+        if points < config.min_points:
+            return False
+        if failure is not None:
+            # One bad scan is no reason to give the window up.
+            is_hopeless = failure is TrackingFailure.GAP_IN_TIME
+            return is_hopeless or self._failures >= config.max_failures
+        moved = log(keyframe_from_body)
+        motion = max(
+            np.linalg.norm(moved[3:]) / config.keyframe_distance_m,
+            np.linalg.norm(moved[:3]) / config.keyframe_angle_rad,
+        )
+        is_new = (
+            registration is not None and 1.0 - registration.known_share >= config.keyframe_new_share
+        )
+        return bool(motion >= (_LEAST_MOTION_SHARE if is_new else 1.0))
 
     def _add_keyframe(
         self,
         scan: Scan,
         points: FloatArray,
         previous_from_body: GaussianPose,
+        error: FloatArray,
+        registration: Registration | None,
         failure: TrackingFailure | None,
     ) -> Tracking:
         keyframe = Keyframe(
@@ -285,27 +320,51 @@ class Odometry:
             previous_from_body=previous_from_body,
             failure=failure,
         )
-        self._move_window(previous_from_body.mean, points, is_lost=failure is not None)
+        # The local map has many keyframes: of each it needs one point per cell.
+        is_planar = self._sensor.is_planar
+        mapped = points if is_planar else points[thin(points, self._config.voxel_size_m)]
+        seen = SeenPoints.of(
+            mapped,
+            scan.sensor_in_body,
+            cell_m=self._config.voxel_size_m,
+            is_planar=is_planar,
+        )
+        self._move_window(previous_from_body.mean, seen, is_lost=failure is not None)
         self._keyframes += 1
         self._keyframe_from_body = certain(identity())
+        self._keyframe_error = error
         self._failures = 0
         self._remember(scan, None)
         here = certain(identity())
-        return Tracking(scan.stamp_s, keyframe.index, here, keyframe, failure)
+        return Tracking(scan.stamp_s, keyframe.index, here, keyframe, failure, registration)
 
-    def _move_window(self, previous_from_body: Pose, points: FloatArray, *, is_lost: bool) -> None:
+    def _move_window(self, previous_from_body: Pose, seen: SeenPoints, *, is_lost: bool) -> None:
         """Express the window in the new keyframe's frame; a lost scan starts a new one."""
         body_from_previous = inverse(previous_from_body)
-        kept = (
-            [] if is_lost else [(body_from_previous @ pose, cloud) for pose, cloud in self._window]
-        )
+        kept = [] if is_lost else [(body_from_previous @ pose, each) for pose, each in self._window]
         self._window.clear()
-        self._window.extend([*kept, (identity(), points)])
-        self._map = RegistrationMap(
-            np.concatenate([transform_points(pose, cloud) for pose, cloud in self._window]),
-            voxel_m=self._config.voxel_size_m,
-            points_per_voxel=self._config.points_per_voxel,
+        self._window.extend([*kept, (identity(), seen)])
+        self._map = LocalMap(
+            SeenPoints(
+                np.concatenate(
+                    [transform_points(pose, each.points) for pose, each in self._window]
+                ),
+                np.concatenate([each.directions @ pose[:3, :3].T for pose, each in self._window]),
+            ),
+            cell_m=self._config.voxel_size_m,
+            sigma_m=self._covariance.sigma_m,
+            degenerate_m=self._covariance.degenerate_m,
             is_planar=self._sensor.is_planar,
+        )
+
+    def _remember_motion(self, posed: Pose, elapsed_s: float, sweep_motion: FloatArray) -> None:
+        self._last_motion = inverse(self._keyframe_from_body.mean) @ posed
+        self._last_sweep_motion = sweep_motion
+        self._last_elapsed_s = elapsed_s
+        self._motion_since_odometry = (
+            identity()
+            if self._has_new_odometry
+            else self._motion_since_odometry @ self._last_motion
         )
 
     def _remember(self, scan: Scan, failure: TrackingFailure | None) -> None:
@@ -313,3 +372,11 @@ class Odometry:
         if failure is None:
             self._registered_s = scan.stamp_s
         self._odometry_at_scan = self._odometry
+
+
+def _information(pose: GaussianPose, axes: np.ndarray) -> FloatArray:
+    """Return the inverse of a covariance along some axes, shape (6, 6), zero elsewhere."""
+    block = np.ix_(axes, axes)
+    result = np.zeros((6, 6))
+    result[block] = np.linalg.inv(pose.covariance[block])
+    return result

@@ -17,8 +17,6 @@ from hmt_service.core.geometry import (
     PLANAR_AXES,
     FloatArray,
     Pose,
-    exp,
-    log,
     project_planar,
     symmetric,
     transform_points,
@@ -49,27 +47,6 @@ def voxel_downsample(points: FloatArray | Points, voxel_m: float) -> FloatArray:
     """Return one original point per occupied voxel, shape (M, 3), M <= N."""
     vectors = kiss_icp_pybind._Vector3dVector(np.asarray(points, dtype=np.float64))
     return np.asarray(kiss_icp_pybind._voxel_down_sample(vectors, voxel_m))
-
-
-def deskew(
-    points: FloatArray, point_times: FloatArray, motion: Pose, max_range_m: float
-) -> FloatArray:
-    """Return the points as if all were captured at one time.
-
-    Args:
-        points: Points in the body frame, shape (N, 3), m.
-        point_times: Capture times as a share of the sweep, shape (N,).
-        motion: Motion of the body during one sweep, shape (4, 4).
-        max_range_m: Points beyond are dropped.
-    """
-    shares = point_times.ravel()
-    span = float(np.ptp(shares))
-    if span <= 0.0:
-        return points
-    # KISS-ICP stretches the times to a whole sweep, so it gets the motion during their span only.
-    preprocessor = kiss_icp_pybind._Preprocessor(max_range_m, 0.0, True, 1)
-    vectors = kiss_icp_pybind._Vector3dVector(points)
-    return np.asarray(preprocessor._preprocess(vectors, shares, exp(span * log(motion))))
 
 
 class RegistrationMap:

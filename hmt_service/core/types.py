@@ -57,8 +57,27 @@ class TrackingFailure(StrEnum):
 
     TOO_FEW_POINTS = "too_few_points"
     TOO_FEW_CORRESPONDENCES = "too_few_correspondences"
+    NOT_CONVERGED = "not_converged"
     CORRECTION_TOO_LARGE = "correction_too_large"
     GAP_IN_TIME = "gap_in_time"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Registration:
+    """How a scan fitted into the local map."""
+
+    inlier_share: float
+    """Share of the returns that lie on what the map holds, in [0, 1]."""
+    known_share: float
+    """Share of the returns where the map holds anything, in [0, 1]; the rest is new space."""
+    prior_weight: float
+    """Share of the predicted motion's information that was believed, in (0, 1]; below 1 the
+    prediction contradicts the scan."""
+    correction_m: float
+    """How far the scan moved the prediction."""
+    degenerate: FloatArray
+    """Directions that the scan says next to nothing about, filled by the prediction: unit tangent
+    vectors, shape (K, 6)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,6 +112,8 @@ class Tracking:
     """The keyframe that this scan became, if it became one."""
     failure: TrackingFailure | None = None
     """Why the scan could not be registered, if so."""
+    registration: Registration | None = None
+    """How it was, or failed to be; None if that was not tried."""
 
 
 class EventKind(StrEnum):

@@ -66,6 +66,7 @@ def save_results(
             }
             for hypothesis in snapshot.posterior.hypotheses
         ],
+        "tracked": engine.tracked,
         "warnings": [event.message for event in engine.warnings],
         "busy_s": {"odometry": report.odometry_busy_s, "topology": report.topology_busy_s},
         "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,

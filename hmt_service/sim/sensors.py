@@ -175,7 +175,7 @@ class Lidar3d(RangeSensor):
 
     A sweep takes the whole period between two scans, counter-clockwise from behind, and ends at the
     stamp of the scan. Column c of C is taken at the share (c + 1) / C of the sweep, and its points
-    are expressed in the body frame of that moment. `core.registration.deskew` carries all of them
+    are expressed in the body frame of that moment. `core.local_map.deskew` carries all of them
     into the body frame at the end of the sweep: there is the true pose of the scan.
     """
 

@@ -8,8 +8,17 @@ from itertools import pairwise
 import numpy as np
 
 from hmt_service.core.config import Config, load_config
-from hmt_service.core.geometry import FloatArray, GaussianPose, Pose, certain, inverse, planar_pose
+from hmt_service.core.geometry import (
+    FloatArray,
+    GaussianPose,
+    Pose,
+    certain,
+    exp,
+    inverse,
+    planar_pose,
+)
 from hmt_service.core.submap import Visit, visit_of
+from hmt_service.core.surfels import Indices, Surfels, _match, build_surfels, directions_of
 from hmt_service.core.types import Keyframe, OdometryReading, Reading, Scan
 
 Walls = FloatArray
@@ -146,6 +155,75 @@ def drifting(path: Sequence[Pose], *, scale: float, turn_rad_per_m: float) -> li
     return result
 
 
+HALL = np.array([-5.0, -4.0, -1.0, 6.0, 4.0, 2.5])
+"""Inside of a room: x0, y0, z0, x1, y1, z1, shape (6,), m."""
+PILLARS = np.array(
+    [
+        [2.0, 1.5, -1.0, 2.6, 2.3, 2.5],
+        [-3.0, -2.6, -1.0, -1.8, -2.0, 0.2],
+        [-1.0, 2.2, 0.6, 0.5, 3.0, 1.4],
+    ]
+)
+"""Boxes that stand in it, shape (P, 6), m: it looks like itself from nowhere else."""
+TUNNEL = np.array([-500.0, -2.0, -1.0, 500.0, 2.0, 1.5])
+"""No end within the range of the sensor."""
+FLOOR = np.array([-500.0, -500.0, -1.2, 500.0, 500.0, 500.0])
+"""Nothing but a floor within the range of the sensor."""
+NO_PILLARS = np.zeros((0, 6))
+COLUMNS = 360
+RINGS = np.linspace(-0.5, 0.5, 24)
+
+
+def sweep_from(
+    world_from_start: Pose,
+    motion: FloatArray,
+    *,
+    hall: FloatArray = HALL,
+    pillars: FloatArray = PILLARS,
+    rings_rad: FloatArray = RINGS,
+    noise: np.random.Generator | None = None,
+    noise_m: float = 0.01,
+) -> tuple[FloatArray, FloatArray]:
+    """Return what a LiDAR sees in a hall, column by column while the robot moves.
+
+    Args:
+        world_from_start: Where the robot is at the start of the sweep.
+        motion: Tangent vector of its motion during the sweep, shape (6,).
+        hall: Inside of the room.
+        pillars: What stands in it.
+        rings_rad: Elevations of the beams.
+        noise: Source of the noise of the ranges, none by default.
+        noise_m: Standard deviation of that noise.
+
+    Returns:
+        Points, each in the body frame when it was taken, shape (N, 3), m; and when that was, as a
+        share of the sweep, shape (N,).
+    """
+    times = np.repeat(np.linspace(0.0, 1.0, COLUMNS), len(rings_rad))
+    azimuths = np.repeat(np.linspace(-np.pi, np.pi, COLUMNS, endpoint=False), len(rings_rad))
+    elevations = np.tile(rings_rad, COLUMNS)
+    rays = np.stack(
+        [
+            np.cos(elevations) * np.cos(azimuths),
+            np.cos(elevations) * np.sin(azimuths),
+            np.sin(elevations),
+        ],
+        axis=1,
+    )
+    poses = world_from_start @ exp(times[:, None] * motion)
+    starts, along = poses[:, :3, 3], np.einsum("nij,nj->ni", poses[:, :3, :3], rays)
+    along = np.where(along == 0.0, 1e-12, along)
+    ranges = ((np.where(along > 0.0, hall[3:], hall[:3]) - starts) / along).min(axis=1)
+    for pillar in pillars:
+        crossings = [(corner - starts) / along for corner in (pillar[:3], pillar[3:])]
+        near, far = np.minimum(*crossings).max(axis=1), np.maximum(*crossings).min(axis=1)
+        ranges = np.where((near > 0.0) & (near < far), np.minimum(ranges, near), ranges)
+    if noise is not None:
+        ranges = ranges + noise.normal(0.0, noise_m, len(ranges))
+    is_return = ranges < 40.0
+    return ranges[is_return, None] * rays[is_return], times[is_return]
+
+
 RING = np.concatenate(
     [
         box(0.0, 0.0, 20.0, 14.0),
@@ -175,3 +253,31 @@ def ring_path(*, laps: float, step_m: float = 0.25) -> list[Pose]:
         path += [corner @ planar_pose(0.0, 0.0, 0.1 * np.pi * i) for i in range(5)]
         pose = corner @ planar_pose(0.0, 0.0, 0.5 * np.pi)
     return path
+
+
+def unpacked(six: FloatArray) -> FloatArray:
+    """Return the symmetric matrix of its upper triangle, shape (3, 3)."""
+    matrix = np.zeros((3, 3))
+    matrix[np.triu_indices(3)] = six
+    return matrix + np.triu(matrix, 1).T
+
+
+def built(points: FloatArray, directions: FloatArray, *, cell_m: float, is_planar: bool) -> Surfels:
+    return build_surfels(
+        points,
+        directions,
+        cell_m=cell_m,
+        sigma_m=0.014,
+        is_planar=is_planar,
+    )
+
+
+def surfels_of(points: FloatArray, sensor: FloatArray, *, cell_m: float = 0.25) -> Surfels:
+    directions = directions_of(points, sensor, (cell_m, 4 * cell_m), is_planar=False)
+    return built(points, directions, cell_m=cell_m, is_planar=False)
+
+
+def matches_of(surfels: Surfels, points: FloatArray, views: FloatArray) -> Indices:
+    """Return the surfel that each point lies on, -1 for none: only these are known to be fitted."""
+    found = [_match(surfels, p[0], p[1], p[2], v) for p, v in zip(points, views, strict=True)]
+    return np.array(found, dtype=np.int64)

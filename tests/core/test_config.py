@@ -24,9 +24,9 @@ def test_presets_differ_in_whether_the_robot_moves_in_a_plane() -> None:
 
 def test_document_changes_only_what_it_names() -> None:
     base = load_config(Preset.OUTDOOR)
-    config = load_config(Preset.OUTDOOR, "odometry: {voxel_size_m: 0.5}")
-    assert config.odometry.voxel_size_m == 0.5
-    assert config.odometry.model_copy(update={"voxel_size_m": 0.75}) == base.odometry
+    config = load_config(Preset.OUTDOOR, "odometry: {voxel_size_m: 0.6}")
+    assert config.odometry.voxel_size_m == 0.6
+    assert config.odometry.model_copy(update={"voxel_size_m": 0.5}) == base.odometry
     assert config.model_copy(update={"odometry": base.odometry}) == base
 
 

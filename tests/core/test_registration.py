@@ -17,7 +17,8 @@ from hmt_service.core.geometry import (
     planar_pose,
     transform_points,
 )
-from hmt_service.core.registration import RegistrationMap, covariance_of, deskew, voxel_downsample
+from hmt_service.core.local_map import deskew
+from hmt_service.core.registration import RegistrationMap, covariance_of, voxel_downsample
 from tests.core.factories import CORRIDOR, ROOM, SQUARE, box, cloud_of, points_from
 
 OFF_PLANE = [0, 1, 5]
@@ -203,7 +204,7 @@ def test_deskewed_points_are_those_of_one_instant() -> None:
             for t, point in zip(times, wall, strict=True)
         ]
     )
-    deskewed = deskew(seen, times, motion, 50.0)
+    deskewed = deskew(seen, times, motion)
     # Whatever instant is chosen, the result is the wall seen from one pose on the way.
     candidates = [
         transform_points(inverse(exp(t * log(motion))), wall) for t in np.linspace(0.0, 1.0, 11)

@@ -19,7 +19,8 @@ from hmt_service.core.geometry import (
     planar_pose,
     transform_points,
 )
-from hmt_service.core.registration import deskew, voxel_downsample
+from hmt_service.core.local_map import deskew
+from hmt_service.core.registration import voxel_downsample
 from hmt_service.core.submap import visit_of
 from hmt_service.core.transients import without_transients
 from hmt_service.core.types import Keyframe, Points, Scan
@@ -288,7 +289,7 @@ def drive_of(family: Family, scans: int, people: int) -> tuple[list[Keyframe], l
         # The noise is that of the empty world, so that what differs is a person.
         is_person = ~is_among(points, alone.points_in_body)
         if scan.point_times is not None:
-            points = deskew(points, scan.point_times, motion, config.sensor.max_range_m)
+            points = deskew(points, scan.point_times, motion)
             people_in_body = points[is_person]
             points = voxel_downsample(points, 0.5 * config.odometry.voxel_size_m)
             is_person = is_among(points, people_in_body)

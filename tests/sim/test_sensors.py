@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from hmt_service.core.geometry import exp, inverse, planar_pose, transform_points, yaw_of
-from hmt_service.core.registration import deskew
+from hmt_service.core.local_map import deskew
 from hmt_service.core.types import OdometryReading, Scan, StampedPose
 from hmt_service.sim.people import Crowd
 from hmt_service.sim.raycasting import RayCaster
@@ -208,7 +208,7 @@ def test_deskewed_points_lie_on_the_walls_and_others_do_not() -> None:
     assert scan.point_times is not None
     truth, sweep = poses[15], exp(5 * xi)
     caster = RayCaster(room())
-    deskewed = deskew(scan.points_in_body, scan.point_times, sweep, EXACT_LIDAR.max_range_m)
+    deskewed = deskew(scan.points_in_body, scan.point_times, sweep)
     assert caster.clearances(transform_points(truth, deskewed)).max() < 1e-3
     skewed = caster.clearances(transform_points(truth, scan.points_in_body))
     assert np.percentile(skewed, 90) > 0.1
