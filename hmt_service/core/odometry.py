@@ -50,6 +50,8 @@ _STAMP_SLACK_S = 1.0
 _KEPT_CELLS, _REGISTERED_CELLS = 0.5, 1.5
 # New space makes a keyframe after this share of the usual motion: never while standing still.
 _LEAST_MOTION_SHARE = 0.2
+# Of so many intervals between scans, the median is what a sweep takes.
+_INTERVALS = 15
 
 
 class Odometry:
@@ -84,7 +86,7 @@ class Odometry:
         self._odometry_at_scan: OdometryReading | None = None
         self._motion_since_odometry = identity()
         self._last_elapsed_s = 0.0
-        self._sweep_s = np.inf
+        self._intervals_s: deque[float] = deque(maxlen=_INTERVALS)
         self._registered_s = 0.0
         self._failures = 0
         compile_kernels(is_planar=config.sensor.is_planar)
@@ -190,10 +192,12 @@ class Odometry:
     def _sweep_of(self, scan: Scan, elapsed_s: float) -> tuple[Sweep, float]:
         """Return what is kept of a scan, and the share of the time since the last that it took."""
         points, times = scan.points_in_body, scan.point_times
-        # Scans may be missing between two, but never is a sweep longer than from one to the next.
-        self._sweep_s = min(self._sweep_s, elapsed_s) if elapsed_s > 0.0 else self._sweep_s
-        is_timed = times is not None and np.isfinite(elapsed_s)
-        share = self._sweep_s / elapsed_s if is_timed and elapsed_s > 0.0 else 1.0
+        is_timed = times is not None and 0.0 < elapsed_s < np.inf
+        share = 1.0
+        if is_timed:
+            # Scans may be missing between two: a sweep takes what is usual from one to the next.
+            self._intervals_s.append(elapsed_s)
+            share = min(float(np.median(self._intervals_s)) / elapsed_s, 1.0)
         lags = np.zeros(len(points)) if times is None or not is_timed else 1.0 - times
         if not self._sensor.is_planar and len(points):
             kept = thin(points, _KEPT_CELLS * self._config.voxel_size_m)
