@@ -39,6 +39,7 @@ from hmt_service.core.types import (
     Tracking,
     TrackingFailure,
 )
+from hmt_service.errors import InvalidInput
 
 # Of a heading that may be anything, and of a position that nothing but speed bounds.
 _LOST_RAD = np.pi / np.sqrt(3.0)
@@ -99,6 +100,9 @@ class Odometry:
 
         Returns:
             What became of the scan; None for odometry.
+
+        Raises:
+            InvalidInput: If the points of a scan are not of shape (N, 3), or their times not (N,).
         """
         if isinstance(reading, OdometryReading):
             if self._has_jumped(reading):
@@ -191,7 +195,12 @@ class Odometry:
 
     def _sweep_of(self, scan: Scan, elapsed_s: float) -> tuple[Sweep, float]:
         """Return what is kept of a scan, and the share of the time since the last that it took."""
-        points, times = scan.points_in_body, scan.point_times
+        # What is compiled does not look at shapes.
+        points = np.ascontiguousarray(scan.points_in_body, dtype=np.float64)
+        times = scan.point_times
+        if points.shape[1:] != (3,) or (times is not None and times.shape != points.shape[:1]):
+            shapes = points.shape, None if times is None else times.shape
+            raise InvalidInput(f"scan at {scan.stamp_s} s with points and times of shape {shapes}")
         is_timed = times is not None and 0.0 < elapsed_s < np.inf
         share = 1.0
         if is_timed:

@@ -90,5 +90,5 @@ def test_an_engine_that_fails_is_told_after_what_it_has_done() -> None:
     assert isinstance(end, End)
     assert not end.is_complete
     assert end.failure is not None
-    assert "Error: " in end.failure
+    assert "InvalidInput: " in end.failure
     assert [type(message) for message in said] == [Entry, Checkpoint]

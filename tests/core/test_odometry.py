@@ -30,6 +30,7 @@ from hmt_service.core.types import (
     Tracking,
     TrackingFailure,
 )
+from hmt_service.errors import InvalidInput
 from tests.core.factories import (
     BEAMS,
     CORRIDOR,
@@ -692,3 +693,12 @@ def planar_square(pose: Pose, truth: Pose, tracking: Tracking) -> float:
     error = log(inverse(pose) @ truth)[PLANAR_AXES]
     block = told.covariance[np.ix_(PLANAR_AXES, PLANAR_AXES)]
     return float(error @ np.linalg.solve(block, error))
+
+
+@pytest.mark.parametrize(
+    ("points", "times"),
+    [(np.zeros((50, 2)), None), (np.zeros(150), None), (np.zeros((50, 3)), np.zeros(49))],
+)
+def test_scan_of_a_wrong_shape_is_refused(points: FloatArray, times: FloatArray | None) -> None:
+    with pytest.raises(InvalidInput, match="shape"):
+        Odometry(load_config()).process(Scan(0.0, points, np.zeros(3), times))
