@@ -8,12 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hmt_service.core.config import load_config
+from hmt_service.core.config import SensorConfig, load_config
 from hmt_service.core.engine import Engine
 from hmt_service.core.geometry import planar_pose
 from hmt_service.core.odometry import Odometry
 from hmt_service.core.types import MapMethod, OdometryReading, Reading, Scan
 from hmt_service.errors import HmtError, InvalidInput, NotFound, Unavailable
+from hmt_service.io import foxglove
 from hmt_service.io.trajectory import read_tum
 from hmt_service.service.client import HmtClient
 from hmt_service.service.codec import decode
@@ -53,14 +54,26 @@ def client(daemon: RunningDaemon) -> Iterator[HmtClient]:
 
 @pytest.fixture(scope="module")
 def offline() -> Engine:
-    """Return the map that one process makes of the same readings."""
+    """Return the map that one process makes of what the daemon receives, to the last bit."""
     config = load_config(text=SETTINGS)
     odometry, engine = Odometry(config), Engine(config)
     for reading in readings(SCANS):
-        if (tracking := odometry.process(reading)) is not None:
+        if (tracking := odometry.process(as_received(reading, config.sensor))) is not None:
             engine.process(tracking)
     engine.finish()
     return engine
+
+
+def as_received(reading: Reading, sensor: SensorConfig) -> Reading:
+    message = foxglove.encode(reading)
+    received = foxglove.decode(
+        message.DESCRIPTOR.full_name,
+        message.SerializeToString(),
+        min_range_m=sensor.min_range_m,
+        max_range_m=sensor.max_range_m,
+    )
+    assert isinstance(received, foxglove.Decoded)
+    return received.reading
 
 
 # ------------------------------------------------------------------ what it is for
