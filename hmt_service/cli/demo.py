@@ -5,12 +5,6 @@ References: own.
 
 from __future__ import annotations
 
-import socket
-import subprocess
-import sys
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -19,7 +13,6 @@ import typer
 from hmt_service.cli import query
 from hmt_service.cli.replay import replay_readings
 from hmt_service.cli.settings import Seed
-from hmt_service.errors import DaemonFailure
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -30,9 +23,6 @@ if TYPE_CHECKING:
 
 PICTURE = "map.png"
 """Name of the figure in the output folder."""
-_START_S = 30.0
-_STOP_S = 10.0
-_POLL_S = 0.05
 
 
 def demo(
@@ -43,6 +33,7 @@ def demo(
     from rich.console import Console
 
     from hmt_service.service.client import HmtClient
+    from hmt_service.service.local import local_daemon
     from hmt_service.service.results import TRAJECTORY
     from hmt_service.sim.simulation import INDOOR_LASER, simulate
     from hmt_service.sim.worlds.office import office
@@ -51,8 +42,8 @@ def demo(
     with console.status("simulating an office building"):
         instants = tuple(simulate(office(seed), INDOOR_LASER, seed))
     console.print(f"simulated {len(instants)} scans and the wheel odometry of a robot in an office")
-    endpoint = _free_endpoint()
-    with _daemon(endpoint, out):
+    out.mkdir(parents=True, exist_ok=True)
+    with local_daemon("--out", str(out)) as endpoint:
         with HmtClient(endpoint) as client:
             readings = tuple(reading for instant in instants for reading in instant.readings)
             replay_readings(client, readings, console, total=len(readings))
@@ -61,45 +52,6 @@ def demo(
         query.map_(connect=endpoint, out=out / PICTURE)
     _report_truth(console, out / TRAJECTORY, [instant.truth for instant in instants])
     console.print(f"picture of both maps: {out / PICTURE}", soft_wrap=True)
-
-
-@contextmanager
-def _daemon(endpoint: str, out: Path) -> Iterator[None]:
-    """Run `hmt serve` in a process of its own, and end it.
-
-    Raises:
-        DaemonFailure: If it does not start.
-    """
-    out.mkdir(parents=True, exist_ok=True)
-    command = [sys.executable, "-m", "hmt_service", "serve", "--listen", endpoint]
-    with subprocess.Popen([*command, "--out", str(out)]) as process:
-        try:
-            _wait_for(endpoint, process)
-            yield
-        finally:
-            process.terminate()
-            try:
-                process.wait(_STOP_S)
-            except subprocess.TimeoutExpired:
-                process.kill()
-
-
-def _wait_for(endpoint: str, process: subprocess.Popen[bytes]) -> None:
-    host, port = endpoint.removeprefix("tcp/").split(":")
-    deadline_s = time.monotonic() + _START_S
-    while time.monotonic() < deadline_s and process.poll() is None:
-        with socket.socket() as probe:
-            probe.settimeout(_POLL_S)
-            if probe.connect_ex((host, int(port))) == 0:
-                return
-        time.sleep(_POLL_S)
-    raise DaemonFailure(f"hmt serve did not listen on {endpoint} within {_START_S:g} s")
-
-
-def _free_endpoint() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
 def _report_truth(console: Console, trajectory: Path, truth: Sequence[StampedPose]) -> None:

@@ -115,13 +115,28 @@ class Engine:
             return self._begin(keyframe)
         extended = self._open.with_keyframe(keyframe)
         if keyframe.failure is not None:
-            first_of_new = len(self._open.keyframes)
             lost = _lost(keyframe, keyframe.failure, registration)
-            return (lost, *self._enter(extended, first_of_new))
+            if not self._is_dead_reckoning(keyframe):
+                return (lost, *self._enter(extended, len(self._open.keyframes)))
+            self._visits[extended.visit] = extended
+            return (lost, *self._divide(extended))
         self._visits[extended.visit] = extended  # metric SLAM
         events = self._weigh(keyframe)  # Eq. (12)
-        border = self._border(extended)  # AAM
-        return events if border is None else (*events, *self._enter(extended, border))  # TSBI
+        return (*events, *self._divide(extended))
+
+    def _divide(self, visit: Visit) -> tuple[Event, ...]:
+        """Enter another area if the robot has left the one of the open visit."""
+        border = self._border(visit)  # AAM
+        return () if border is None else self._enter(visit, border)  # TSBI
+
+    def _is_dead_reckoning(self, keyframe: Keyframe) -> bool:
+        """Return whether the wheels alone lead from one unregistered keyframe to the next.
+
+        Scans that never fit (a wrong preset, a blinded sensor) would make an area of each keyframe,
+        every one like every other: what is driven blindly is one area.
+        """
+        is_blind = self._open.keyframes[-1].failure is not None
+        return is_blind and keyframe.previous_from_body.sigma_m < _BRIDGED_M
 
     def _border(self, visit: Visit) -> int | None:
         """Return the first keyframe of the area that the robot has entered, if it has."""
@@ -459,6 +474,8 @@ class Engine:
 
 
 _ANY_CUT = 2.0
+# A gap that the wheels bridge so well is none.
+_BRIDGED_M = 0.25
 _NO_POINTS: Points = np.zeros((0, 3), dtype=np.float32)
 
 
@@ -481,7 +498,7 @@ def _lost(keyframe: Keyframe, failure: TrackingFailure, registration: Registrati
     if registration is not None:
         numbers["inlier_share"] = registration.inlier_share
         numbers["correction_m"] = registration.correction_m
-    message = f"keyframe {keyframe.index} was not registered ({failure}): a new area begins"
+    message = f"keyframe {keyframe.index} was not registered ({failure})"
     return Event(EventKind.LOST, keyframe.stamp_s, message, numbers)
 
 

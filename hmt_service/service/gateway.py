@@ -112,6 +112,9 @@ class Gateway:
     def close_input(self) -> None:
         """Take no more samples, and say so to everybody who asks."""
         self._is_stopping = True
+        # Samples still come while a subscriber is undeclared: behind the last `Finish` they would
+        # be mapped after the map was saved.
+        self._intake.close()
         self._subscriber.undeclare()
 
     def close(self) -> None:

@@ -77,6 +77,7 @@ class Intake:
         self._window = ReorderWindow(limits.reorder_s)
         self._thread = threading.Thread(target=self._pump, name="intake", daemon=True)
         self._lock = threading.Lock()
+        self._is_closed = False
         self._is_stopped = False
         self._received = 0
         self._accepted = 0
@@ -112,7 +113,7 @@ class Intake:
                 self._refused[Refusal.UNKNOWN_KEY] += 1
             elif size > self._limits.sample_bytes:
                 self._refused[Refusal.TOO_LARGE] += 1
-            elif self._is_stopped:
+            elif self._is_closed:
                 self._refused[Refusal.STOPPING] += 1
             elif not self._queue.offer(_Sample(name, *read()), size + _OVERHEAD_BYTES):
                 self._refused[Refusal.QUEUE_FULL] += 1
@@ -121,8 +122,14 @@ class Intake:
         """Hand on what has arrived without waiting for earlier readings, and `finish` behind it."""
         self._queue.put_token(finish)
 
+    def close(self) -> None:
+        """Refuse every sample from now on; what has arrived is still handed on."""
+        with self._lock:
+            self._is_closed = True
+
     def stop(self) -> None:
-        """Take nothing more; what has arrived is still handed on."""
+        """End when all that has arrived is handed on."""
+        self.close()
         with self._lock:
             self._is_stopped = True
             self._queue.put_token(_Stop())

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from benchmarks import accuracy
+from benchmarks import accuracy, metric_level
 from benchmarks.__main__ import REGISTRY, WORSE, Name, app
 from benchmarks.metric import (
     BaselineValue,
@@ -283,6 +283,7 @@ def test_without_recorded_logs_accuracy_is_skipped_with_the_reason(
 ) -> None:
     none = tmp_path / "none"
     monkeypatch.setattr(accuracy, "measure_simulated", lambda _: Report(()))
+    monkeypatch.setattr(metric_level, "measure", lambda _: Report(()))
     monkeypatch.delenv("HMT_DATA", raising=False)
     assert "skipped accuracy/intel: HMT_DATA does not name the folder" in run("--baseline", none)
     monkeypatch.setenv("HMT_DATA", str(tmp_path))

@@ -19,8 +19,9 @@ from hmt_service.errors import NotFound, Unavailable
 from hmt_service.io.logs import read_log
 from hmt_service.io.mcap_log import McapWriter
 from hmt_service.io.trajectory import read_tum
+from hmt_service.service.local import free_endpoint
 from tests.flat import SETTINGS, path, ranges_from, readings
-from tests.service.harness import RunningDaemon, free_endpoint, running_daemon
+from tests.service.harness import RunningDaemon, as_received, running_daemon
 
 SCANS = 200
 PERIOD_S = 0.1
@@ -73,7 +74,7 @@ def test_a_replayed_log_makes_the_map_of_the_offline_run(daemon: RunningDaemon, 
     ).readings
     odometry, engine = Odometry(config), Engine(config)
     for reading in readings:
-        if (tracking := odometry.process(reading)) is not None:
+        if (tracking := odometry.process(as_received(reading, sensor))) is not None:
             engine.process(tracking)
     engine.finish()
     saved = read_tum(daemon.out / "trajectory.tum")

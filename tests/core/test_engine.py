@@ -332,19 +332,28 @@ def test_next_room_settles_which_twin_it_was() -> None:
     assert best.probability > 0.95
 
 
-def test_lost_scan_begins_another_visit_at_once() -> None:
+def lost_after_stay(count: int, motion: GaussianPose) -> list[tuple[int, int]]:
+    """Return first and last keyframes of the visits when, after a stay, keyframes are lost."""
     trackings = trackings_of((ROOM, STAY, certain(identity())))
-    (after,) = keyframes_along(ROOM, [STAY[-1]], first=len(STAY))
-    lost = replace(
-        after,
-        failure=TrackingFailure.GAP_IN_TIME,
-        previous_from_body=GaussianPose(identity(), motion_covariance(0.5, 5.0)),
-    )
-    engine, _ = processed(
-        [*trackings, Tracking(lost.stamp_s, lost.index, certain(identity()), lost, lost.failure)]
-    )
-    visits = engine.stored().visits
-    assert [(v.first_keyframe, v.last_keyframe) for v in visits] == [(0, 5), (6, 6)]
+    for keyframe in keyframes_along(ROOM, [STAY[-1]] * count, first=len(STAY)):
+        failure = TrackingFailure.TOO_FEW_CORRESPONDENCES
+        lost = replace(keyframe, failure=failure, previous_from_body=motion)
+        here = certain(identity())
+        trackings.append(Tracking(lost.stamp_s, lost.index, here, lost, failure))
+    engine, _ = processed(trackings)
+    return [(visit.first_keyframe, visit.last_keyframe) for visit in engine.stored().visits]
+
+
+def test_lost_scan_begins_another_visit_at_once() -> None:
+    far = GaussianPose(identity(), motion_covariance(0.5, 5.0))
+    assert lost_after_stay(1, far) == [(0, 5), (6, 6)]
+
+
+def test_what_is_driven_blindly_on_good_wheels_is_one_visit() -> None:
+    near = GaussianPose(identity(), motion_covariance(0.02, 0.05))
+    far = GaussianPose(identity(), motion_covariance(0.5, 5.0))
+    assert lost_after_stay(3, near) == [(0, 5), (6, 8)]
+    assert lost_after_stay(3, far) == [(0, 5), (6, 6), (7, 7), (8, 8)]
 
 
 def test_trackings_without_a_keyframe_change_nothing_but_the_trajectory() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import socket
 import subprocess
 import sys
 import time
@@ -11,10 +10,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from hmt_service.core.config import Preset
-from hmt_service.errors import Unavailable
+from hmt_service.core.config import Preset, SensorConfig
+from hmt_service.core.types import Reading
+from hmt_service.io import foxglove
 from hmt_service.service.client import HmtClient
-from hmt_service.service.reports import DaemonState
+from hmt_service.service.local import free_endpoint, is_running
 from tests.flat import SETTINGS
 
 DEADLINE_S = 20.0
@@ -26,13 +26,6 @@ def wait_until(is_true: Callable[[], bool], *, timeout_s: float = DEADLINE_S) ->
     while not is_true():
         assert time.monotonic() < deadline_s, f"not within {timeout_s} s"
         time.sleep(0.01)
-
-
-def free_endpoint() -> str:
-    """Return a loopback endpoint that nobody listens on."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
 @dataclass
@@ -90,8 +83,17 @@ def running_daemon(
 
 def _is_running(daemon: RunningDaemon) -> bool:
     assert daemon.process.poll() is None, daemon.output()
-    try:
-        with daemon.client() as client:
-            return client.status().state is DaemonState.RUNNING
-    except Unavailable:
-        return False
+    return is_running(daemon.endpoint)
+
+
+def as_received(reading: Reading, sensor: SensorConfig) -> Reading:
+    """Return a reading as the daemon receives it, to the last bit."""
+    message = foxglove.encode(reading)
+    received = foxglove.decode(
+        message.DESCRIPTOR.full_name,
+        message.SerializeToString(),
+        min_range_m=sensor.min_range_m,
+        max_range_m=sensor.max_range_m,
+    )
+    assert isinstance(received, foxglove.Decoded)
+    return received.reading

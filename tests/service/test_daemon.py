@@ -8,13 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hmt_service.core.config import SensorConfig, load_config
+from hmt_service.core.config import load_config
 from hmt_service.core.engine import Engine
 from hmt_service.core.geometry import planar_pose
 from hmt_service.core.odometry import Odometry
 from hmt_service.core.types import MapMethod, OdometryReading, Reading, Scan
 from hmt_service.errors import HmtError, InvalidInput, NotFound, Unavailable
-from hmt_service.io import foxglove
 from hmt_service.io.trajectory import read_tum
 from hmt_service.service.client import HmtClient
 from hmt_service.service.codec import decode
@@ -23,7 +22,7 @@ from hmt_service.service.readings import encode_reading
 from hmt_service.service.session import Endpoints, Mode, open_session
 from tests.flat import SETTINGS, readings
 from tests.messages import laser_scan
-from tests.service.harness import RunningDaemon, running_daemon, wait_until
+from tests.service.harness import RunningDaemon, as_received, running_daemon, wait_until
 
 SCANS = 200
 NAN, INF = float("nan"), float("inf")
@@ -62,18 +61,6 @@ def offline() -> Engine:
             engine.process(tracking)
     engine.finish()
     return engine
-
-
-def as_received(reading: Reading, sensor: SensorConfig) -> Reading:
-    message = foxglove.encode(reading)
-    received = foxglove.decode(
-        message.DESCRIPTOR.full_name,
-        message.SerializeToString(),
-        min_range_m=sensor.min_range_m,
-        max_range_m=sensor.max_range_m,
-    )
-    assert isinstance(received, foxglove.Decoded)
-    return received.reading
 
 
 # ------------------------------------------------------------------ what it is for

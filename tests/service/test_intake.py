@@ -142,6 +142,16 @@ def test_discarded_samples_are_counted(intake: Intake, sink: Sink) -> None:
     assert counts.queued == 0
 
 
+def test_what_comes_late_does_not_pass_the_last_finish(intake: Intake, sink: Sink) -> None:
+    early, late = readings(1)
+    send(intake, early)
+    intake.close()
+    send(intake, late)
+    finished(intake, sink, 1)
+    assert sink.finished == [(1, 1)]
+    assert intake.counts().refused == {"stopping": 1}
+
+
 def test_nothing_is_taken_after_the_end(intake: Intake) -> None:
     intake.stop()
     send(intake, readings(1)[0])

@@ -26,10 +26,11 @@ from hmt_service.runtime.messages import ProcessName
 from hmt_service.service.client import HmtClient
 from hmt_service.service.codec import decode
 from hmt_service.service.keys import Call, Keys, Topic
+from hmt_service.service.local import free_endpoint
 from hmt_service.service.reports import DaemonState
 from hmt_service.service.session import Endpoints, Mode, open_session
 from tests.flat import readings
-from tests.service.harness import RunningDaemon, free_endpoint, running_daemon, wait_until
+from tests.service.harness import RunningDaemon, running_daemon, wait_until
 
 FILES = ["map.hmt", "summary.json", "trajectory.tum"]
 SURPLUS = 3000

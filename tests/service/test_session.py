@@ -5,8 +5,8 @@ import pytest
 from hmt_service.errors import Unavailable
 from hmt_service.service.client import HmtClient
 from hmt_service.service.keys import Input
+from hmt_service.service.local import free_endpoint
 from hmt_service.service.session import Endpoints, Mode, open_session
-from tests.service.harness import free_endpoint
 
 
 def test_a_client_without_daemon_says_where_it_looked() -> None:

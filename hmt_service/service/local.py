@@ -1,0 +1,71 @@
+"""A daemon in processes of its own on this machine: for the demo, the benchmarks and the tests.
+
+References: own.
+"""
+
+from __future__ import annotations
+
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import IO
+
+from hmt_service.errors import DaemonFailure, Unavailable
+from hmt_service.service.client import HmtClient
+from hmt_service.service.reports import DaemonState
+
+_START_S = 30.0
+_STOP_S = 10.0
+_POLL_S = 0.05
+
+
+def free_endpoint() -> str:
+    """Return a loopback endpoint that nobody listens on."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+def is_running(endpoint: str) -> bool:
+    """Return whether a daemon there takes work: one that listens may still load its libraries."""
+    try:
+        with HmtClient(endpoint) as client:
+            return client.status().state is DaemonState.RUNNING
+    except Unavailable:
+        return False
+
+
+@contextmanager
+def local_daemon(*options: str, output: IO[str] | None = None) -> Iterator[str]:
+    """Run `hmt serve`, ready for work, on a loopback endpoint that is free; end it afterwards.
+
+    Args:
+        options: Further options of `hmt serve`.
+        output: File that takes what it prints; None for where this program prints. (A pipe that
+            nobody reads would stop the daemon once it is full.)
+
+    Yields:
+        The endpoint.
+
+    Raises:
+        DaemonFailure: If it ends or is not ready in time.
+    """
+    endpoint = free_endpoint()
+    command = [sys.executable, "-m", "hmt_service", "serve", "--listen", endpoint, *options]
+    with subprocess.Popen(command, stdout=output, stderr=output) as process:
+        try:
+            deadline_s = time.monotonic() + _START_S
+            while not is_running(endpoint):
+                if process.poll() is not None or time.monotonic() > deadline_s:
+                    raise DaemonFailure(f"hmt serve is not ready at {endpoint} in {_START_S:g} s")
+                time.sleep(_POLL_S)
+            yield endpoint
+        finally:
+            process.terminate()
+            try:
+                process.wait(_STOP_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
