@@ -18,26 +18,17 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.belief_figures import draw_p_true, draw_reliability
-from benchmarks.calibration import Scores, consistency, is_contested, score
+from benchmarks.calibration import Scores, consistency_metrics, is_contested, score
 from benchmarks.cells import Result
 from benchmarks.metric import Direction, Metric
 from benchmarks.report import Report, Run
 from benchmarks.scoring import Decision
+from benchmarks.simulated import BLIND
 from benchmarks.world_belief import WorldBelief, as_result, believe, from_result
 from hmt_service.core.config import load_config
-from hmt_service.sim.sensors import Laser2d, WheelOdometry
 from hmt_service.sim.simulation import Robot, simulate
 from hmt_service.sim.usual import USUAL_ROBOTS, preset_for
 from hmt_service.sim.worlds.families import Family, draw
-
-BLIND = Robot(
-    sensor=Laser2d(max_range_m=4.0),
-    odometry=WheelOdometry(
-        scale=1.1, drift_rad_per_m=0.03, slips_per_m=0.05, slip_m=0.3, slip_sigma_rad=0.1
-    ),
-)
-"""Sees a door or two, and its wheels are always as wrong as the motion model expects them to be now
-and then; every 20 m they slip. With little to tell places apart, it must be in doubt."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +66,6 @@ _ALL = "all"
 _RIGHT_TOLERANCE = 0.2
 _LOOPS_TOLERANCE = 0.3
 _SCORE_TOLERANCE = 0.05
-_ERROR_TOLERANCE = 0.5
 _COVERAGE_TOLERANCE = 0.2
 _LOWER, _HIGHER = Direction.LOWER_IS_BETTER, Direction.HIGHER_IS_BETTER
 
@@ -125,7 +115,12 @@ def report_of(beliefs: Mapping[str, Sequence[WorldBelief]], out: Path) -> Report
         of_preset = [belief for belief in everything if belief.is_planar is is_planar]
         for what, errors in _errors(of_preset).items():
             if errors:
-                metrics += _consistency(f"nees_{sensor}/{what}", errors, is_planar=is_planar)
+                metrics += consistency_metrics(
+                    f"nees_{sensor}/{what}",
+                    errors,
+                    is_planar=is_planar,
+                    coverage_tolerance=_COVERAGE_TOLERANCE,
+                )
             elif of_preset:
                 skipped.append(f"nees_{sensor}/{what}: {len(of_preset)} maps, none of them right")
     panels = {"All": score(decisions)} | ({"Contested": score(contested)} if contested else {})
@@ -209,11 +204,3 @@ def _errors(worlds: Sequence[WorldBelief]) -> Mapping[str, list[float]]:
         "arcs": [error for world in worlds for error in world.arc_errors],
         "areas": [error for world in worlds for error in world.area_errors],
     }
-
-
-def _consistency(name: str, errors: Sequence[float], *, is_planar: bool) -> Iterator[Metric]:
-    found = consistency(errors, is_planar=is_planar)
-    yield Metric(f"{name}/count", float(found.count), "1", _HIGHER, None)
-    yield Metric(f"{name}/mean", found.mean, "1", _LOWER, None)
-    yield Metric(f"{name}/median", found.median, "1", _LOWER, _ERROR_TOLERANCE)
-    yield Metric(f"{name}/coverage", found.coverage, "1", _HIGHER, _COVERAGE_TOLERANCE)

@@ -11,12 +11,13 @@ References:
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.stats import chi2
 
+from benchmarks.metric import Direction, Metric
 from benchmarks.scoring import Decision
 from hmt_service.core.geometry import PLANAR_AXES, GaussianPose, Pose, inverse, log
 from hmt_service.errors import InvalidInput
@@ -26,6 +27,7 @@ BINS = 10
 LEAST_PROBABILITY = 1e-6
 """What the logarithmic score takes for a probability of zero: no belief costs more than 13.8."""
 _CERTAIN = 0.99
+_MEDIAN_TOLERANCE = 0.5
 _Z_95 = 1.959964
 
 
@@ -186,3 +188,22 @@ def consistency(errors: Sequence[float], *, is_planar: bool) -> Consistency:
         median=float(np.median(errors) * freedom / chi2.median(freedom)),
         coverage=float(np.mean(np.array(errors) * freedom <= chi2.ppf(0.95, freedom))),
     )
+
+
+def consistency_metrics(
+    name: str, errors: Sequence[float], *, is_planar: bool, coverage_tolerance: float
+) -> Iterator[Metric]:
+    """Yield how consistent errors are as metrics.
+
+    Args:
+        name: What they were measured on.
+        errors: As of `normalised_error`.
+        is_planar: Whether they have three degrees of freedom or six.
+        coverage_tolerance: Share by which the coverage may fall before the gate says so.
+    """
+    found = consistency(errors, is_planar=is_planar)
+    lower, higher = Direction.LOWER_IS_BETTER, Direction.HIGHER_IS_BETTER
+    yield Metric(f"{name}/count", float(found.count), "1", higher, None)
+    yield Metric(f"{name}/mean", found.mean, "1", lower, None)
+    yield Metric(f"{name}/median", found.median, "1", lower, _MEDIAN_TOLERANCE)
+    yield Metric(f"{name}/coverage", found.coverage, "1", higher, coverage_tolerance)

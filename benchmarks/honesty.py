@@ -9,31 +9,22 @@ References:
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import islice
 
-from benchmarks.calibration import consistency, normalised_error
+from benchmarks.calibration import consistency_metrics, normalised_error
 from benchmarks.cells import Result
 from benchmarks.metric import Direction, Metric
 from benchmarks.report import Report, Run
+from benchmarks.simulated import BLIND, LIDAR_64
 from hmt_service.core.config import load_config
 from hmt_service.core.geometry import Pose, inverse
 from hmt_service.core.odometry import Odometry
-from hmt_service.sim.sensors import Laser2d, Lidar3d, WheelOdometry
 from hmt_service.sim.simulation import LIDAR, Robot, simulate
 from hmt_service.sim.usual import USUAL_ROBOTS, preset_for
 from hmt_service.sim.worlds.families import Family, draw
-
-_BLIND = Robot(
-    sensor=Laser2d(max_range_m=4.0),
-    odometry=WheelOdometry(
-        scale=1.1, drift_rad_per_m=0.03, slips_per_m=0.05, slip_m=0.3, slip_sigma_rad=0.1
-    ),
-)
-"""Sees walls beside it only in a corridor, and its wheels slip every 20 m."""
-_LIDAR_64 = Robot(follower=LIDAR.follower, sensor=Lidar3d(rows=64, columns=1024), scan_period_s=0.1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,10 +46,10 @@ _DRIVES = {
     "nested-loops": _Drive(Family.NESTED_LOOPS, 30, 2500),
     "warehouse": _Drive(Family.WAREHOUSE, 30, 2500),
     "campus-laser": _Drive(Family.CAMPUS, 30, 2500, parameters={"relief_m": 0.0}),
-    "office-blind": _Drive(Family.OFFICE, 32, 2500, _BLIND),
-    "aliased-blind": _Drive(Family.ALIASED, 32, 2500, _BLIND, {"severity": 1.0}),
-    "garage-64": _Drive(Family.GARAGE, 31, 300, _LIDAR_64),
-    "campus-64": _Drive(Family.CAMPUS, 31, 300, _LIDAR_64),
+    "office-blind": _Drive(Family.OFFICE, 32, 2500, BLIND),
+    "aliased-blind": _Drive(Family.ALIASED, 32, 2500, BLIND, {"severity": 1.0}),
+    "garage-64": _Drive(Family.GARAGE, 31, 300, LIDAR_64),
+    "campus-64": _Drive(Family.CAMPUS, 31, 300, LIDAR_64),
 } | {
     f"{family}-lidar/{seed}": _Drive(family, seed, 800, LIDAR)
     for family in (Family.GARAGE, Family.OFFICE, Family.CAMPUS, Family.WAREHOUSE)
@@ -85,9 +76,13 @@ def measure(run: Run) -> Report:
             if results[f"honesty/{name}"]["is_planar"] is is_planar
         }
         everything = [error for errors in found.values() for error in errors]
-        metrics += _metrics(f"honesty/{sensor}", everything, is_planar=is_planar)
-        for name, errors in found.items():
-            metrics += _metrics(f"honesty/{sensor}/{name}", errors, is_planar=is_planar)
+        for name, errors in {"all": everything, **found}.items():
+            metrics += consistency_metrics(
+                f"honesty/{sensor}/{name}",
+                errors,
+                is_planar=is_planar,
+                coverage_tolerance=_COVERAGE_TOLERANCE,
+            )
     return Report(tuple(metrics))
 
 
@@ -111,11 +106,3 @@ def _track(drive: _Drive) -> Result:
                 errors.append(normalised_error(belief, inverse(before) @ now, is_planar=is_planar))
             before = now
     return {"errors": errors, "is_planar": is_planar}
-
-
-def _metrics(prefix: str, errors: Sequence[float], *, is_planar: bool) -> Iterator[Metric]:
-    found = consistency(errors, is_planar=is_planar)
-    yield Metric(f"{prefix}/steps", float(found.count), "1", _HIGHER, None)
-    yield Metric(f"{prefix}/nees_mean", found.mean, "1", _LOWER, None)
-    yield Metric(f"{prefix}/nees_median", found.median, "1", _LOWER, None)
-    yield Metric(f"{prefix}/coverage", found.coverage, "1", _HIGHER, _COVERAGE_TOLERANCE)

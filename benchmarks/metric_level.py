@@ -34,20 +34,16 @@ from benchmarks.relative_motion import motion_errors
 from benchmarks.report import Report, Run
 from benchmarks.resident import resident_memory
 from benchmarks.short_steps import StepErrors, step_errors
-from benchmarks.simulated import readings_of
+from benchmarks.simulated import LIDAR_64, readings_of
 from benchmarks.tracking import Program, TrackingRun, run_tracker
 from hmt_service.core.config import Preset, load_config
 from hmt_service.core.geometry import FloatArray, exp, log
 from hmt_service.core.types import OdometryReading, StampedPose
 from hmt_service.io.relations import read_relations
-from hmt_service.sim.sensors import Lidar3d
 from hmt_service.sim.simulation import INDOOR_LASER, LIDAR, Robot, simulate
 from hmt_service.sim.trajectories import STEP_S
 from hmt_service.sim.usual import preset_for
 from hmt_service.sim.worlds.families import Family, draw
-
-LIDAR_64 = Robot(follower=LIDAR.follower, sensor=Lidar3d(rows=64, columns=1024), scan_period_s=0.1)
-"""64 rows of 1024 columns at 10 Hz: up to 65,536 points per scan."""
 
 
 @dataclass(frozen=True, slots=True)

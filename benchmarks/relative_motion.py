@@ -11,16 +11,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
 from evo.core.filters import FilterException
-from evo.core.metrics import RPE, PoseRelation, StatisticsType, Unit
-from evo.core.trajectory import PoseTrajectory3D
+from evo.core.metrics import PoseRelation
 
-from benchmarks.trajectories import RELATIVE_OVER_M
+from benchmarks.trajectories import RELATIVE_OVER_M, evo_trajectory, relative_error
 from hmt_service.core.types import StampedPose
 from hmt_service.errors import InvalidInput
-
-_TOLERANCE = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,10 +39,9 @@ def motion_errors(estimate: Sequence[StampedPose], truth: Sequence[StampedPose])
     Raises:
         InvalidInput: If the true path is shorter than `RELATIVE_OVER_M`.
     """
-    pair = _evo(truth), _evo(estimate)
     try:
         means = [
-            _mean(pair, relation)
+            relative_error(evo_trajectory(truth), evo_trajectory(estimate), relation)
             for relation in (PoseRelation.translation_part, PoseRelation.rotation_angle_deg)
         ]
     except FilterException as error:
@@ -54,23 +49,3 @@ def motion_errors(estimate: Sequence[StampedPose], truth: Sequence[StampedPose])
             f"{len(truth)} true poses have no two {RELATIVE_OVER_M:g} m of path apart: {error}"
         ) from error
     return MotionErrors(*means)
-
-
-def _mean(pair: tuple[PoseTrajectory3D, PoseTrajectory3D], relation: PoseRelation) -> float:
-    errors = RPE(
-        relation,
-        delta=RELATIVE_OVER_M,
-        delta_unit=Unit.meters,
-        rel_delta_tol=_TOLERANCE,
-        all_pairs=True,
-        pairs_from_reference=True,
-    )
-    errors.process_data(pair)
-    return float(errors.get_statistic(StatisticsType.mean))
-
-
-def _evo(trajectory: Sequence[StampedPose]) -> PoseTrajectory3D:
-    return PoseTrajectory3D(
-        poses_se3=[pose.reference_from_body for pose in trajectory],
-        timestamps=np.array([pose.stamp_s for pose in trajectory]),
-    )

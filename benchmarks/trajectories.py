@@ -61,10 +61,10 @@ def trajectory_errors(
     """
     try:
         true, estimated = associate_trajectories(
-            _evo(truth), _evo(estimate), max_diff=_LARGEST_GAP_S
+            evo_trajectory(truth), evo_trajectory(estimate), max_diff=_LARGEST_GAP_S
         )
         relative = [
-            _relative(true, estimated, relation)
+            relative_error(true, estimated, relation)
             for relation in (PoseRelation.translation_part, PoseRelation.rotation_angle_deg)
         ]
         estimated.align(true)
@@ -111,7 +111,14 @@ def metrics_of(prefix: str, errors: TrajectoryErrors) -> Iterator[Metric]:
     yield Metric(f"{prefix}/absolute_max", errors.absolute_max_m, "m", _LOWER, None)
 
 
-def _relative(true: PoseTrajectory3D, estimated: PoseTrajectory3D, relation: PoseRelation) -> float:
+def relative_error(
+    true: PoseTrajectory3D, estimated: PoseTrajectory3D, relation: PoseRelation
+) -> float:
+    """Return the mean error of the motion over `RELATIVE_OVER_M` of the true path.
+
+    Raises:
+        FilterException: If the true path is shorter.
+    """
     errors = RPE(
         relation,
         delta=RELATIVE_OVER_M,
@@ -124,7 +131,8 @@ def _relative(true: PoseTrajectory3D, estimated: PoseTrajectory3D, relation: Pos
     return float(errors.get_statistic(StatisticsType.mean))
 
 
-def _evo(trajectory: Sequence[StampedPose]) -> PoseTrajectory3D:
+def evo_trajectory(trajectory: Sequence[StampedPose]) -> PoseTrajectory3D:
+    """Return a trajectory as evo's."""
     return PoseTrajectory3D(
         poses_se3=[pose.reference_from_body for pose in trajectory],
         timestamps=np.array([pose.stamp_s for pose in trajectory]),

@@ -86,8 +86,10 @@ class MotionConfig(Section):
     """Least standard deviation of a rotation."""
     max_speed_m_s: float = Field(default=5.0, gt=0.0)
     """Odometry that moves faster has jumped; a robot out of sight cannot have gone farther."""
-    constant_velocity_factor: float = Field(default=5.0, ge=1.0)
-    """How many times less the motion is known without odometry, from constant velocity."""
+    acceleration_m_s2: float = Field(default=2.0, gt=0.0)
+    """Standard deviation of how the speed changes, where constant velocity replaces odometry."""
+    angular_acceleration_rad_s2: float = Field(default=2.0, gt=0.0)
+    """Standard deviation of how the turn rate changes there."""
 
 
 class CovarianceConfig(Section):
@@ -244,7 +246,7 @@ _PRESETS: dict[Preset, dict[str, Any]] = {
         },
         "odometry": {
             "voxel_size_m": 0.5,
-            "keyframe_distance_m": 1.5,
+            "keyframe_distance_m": 2.5,
             "window_keyframes": 15,
             "max_correction_m": 5.0,
         },

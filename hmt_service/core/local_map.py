@@ -100,6 +100,8 @@ class Fit:
 
     pose: Pose
     """`map_from_body` at the end of the sweep, fused with the prior, shape (4, 4)."""
+    covariance: FloatArray
+    """Of that, shape (6, 6); degenerate directions are as certain as the prior."""
     motion: FloatArray
     """Motion during the sweep as a tangent vector, shape (6,)."""
     information: FloatArray
@@ -226,8 +228,12 @@ class LocalMap:
                 information[6:, 6:], information[6:, :6]
             )
         known, degenerate = _known_directions(own, axes, 1.0 / self._degenerate_m**2)
+        covariance = np.zeros((6, 6))
+        together = known + weight * prior_information
+        covariance[block] = symmetric(np.linalg.inv(together[block]))
         return Fit(
             pose=pose,
+            covariance=covariance,
             motion=moving,
             information=known,
             degenerate=degenerate,

@@ -13,7 +13,6 @@ import numpy as np
 
 from hmt_service.core.config import Config
 from hmt_service.core.geometry import (
-    PLANAR_AXES,
     FloatArray,
     GaussianPose,
     Pose,
@@ -72,7 +71,6 @@ class Odometry:
         self._config = config.odometry
         self._motion = config.motion
         self._covariance = config.covariance
-        self._axes = PLANAR_AXES if config.sensor.is_planar else np.arange(6)
         self._window: deque[tuple[Pose, SeenPoints]] = deque(
             maxlen=config.odometry.window_keyframes
         )
@@ -167,29 +165,31 @@ class Odometry:
 
     def _predict(self, elapsed_s: float) -> GaussianPose:
         """Return the motion since the last scan: by the wheels, or as it was before."""
-        now, before = self._odometry, self._odometry_at_scan
+        now, before, noise = self._odometry, self._odometry_at_scan, self._motion
         if now is not None and before is not None and now is not before:
             measured = inverse(before.odom_from_body) @ now.odom_from_body
             # Scans that came without odometry have been tracked through part of it already.
             motion = inverse(self._motion_since_odometry) @ measured
-            times, factor = 1.0, 1.0
+            xi = log(measured)
+            turned, travelled = float(np.linalg.norm(xi[:3])), float(np.linalg.norm(xi[3:]))
+            sigma_rad = (
+                noise.sigma_floor_rad
+                + noise.sigma_rotation_share * turned
+                + noise.sigma_rotation_rad_per_m * travelled
+            )
+            sigma_m = noise.sigma_floor_m + noise.sigma_translation_share * travelled
+        elif self._last_elapsed_s > 0.0:
+            motion = exp(elapsed_s / self._last_elapsed_s * log(self._last_motion))
+            # Speed has changed since the interval before, for as long as this one takes.
+            sigma_rad = min(
+                noise.sigma_floor_rad + noise.angular_acceleration_rad_s2 * elapsed_s**2, _LOST_RAD
+            )
+            sigma_m = noise.sigma_floor_m + noise.acceleration_m_s2 * elapsed_s**2
         else:
-            times = elapsed_s / self._last_elapsed_s if self._last_elapsed_s > 0.0 else 1.0
-            motion = measured = exp(times * log(self._last_motion))
-            factor = self._motion.constant_velocity_factor
+            motion = identity()
+            sigma_rad, sigma_m = _LOST_RAD, noise.max_speed_m_s * elapsed_s
         if self._sensor.is_planar:
             motion = project_planar(motion)
-        xi = log(measured)
-        turned, travelled = float(np.linalg.norm(xi[:3])), float(np.linalg.norm(xi[3:]))
-        noise = self._motion
-        scans = max(times, 1.0)
-        sigma_rad = factor * (
-            noise.sigma_floor_rad * scans
-            + noise.sigma_rotation_share * turned
-            + noise.sigma_rotation_rad_per_m * travelled
-        )
-        sigma_rad = min(sigma_rad, _LOST_RAD)
-        sigma_m = factor * (noise.sigma_floor_m * scans + noise.sigma_translation_share * travelled)
         covariance = isotropic_covariance(sigma_rad=sigma_rad, sigma_m=sigma_m)
         return self._confined(GaussianPose(motion, covariance))
 
@@ -231,13 +231,10 @@ class Odometry:
         failure = self._failure_of(fit, predicted)
         if failure is not None:
             return predicted, fit, failure
-        block = np.ix_(self._axes, self._axes)
-        together = fit.information + fit.prior_weight * _information(predicted, self._axes)
-        covariance = isotropic_covariance(
+        floor = isotropic_covariance(
             sigma_rad=self._covariance.floor_rad, sigma_m=self._covariance.floor_m
         )
-        covariance[block] += symmetric(np.linalg.inv(together[block]))
-        return self._confined(GaussianPose(fit.pose, covariance)), fit, None
+        return self._confined(GaussianPose(fit.pose, fit.covariance + floor)), fit, None
 
     def _failure_of(self, fit: Fit, predicted: GaussianPose) -> TrackingFailure | None:
         config = self._config
@@ -385,11 +382,3 @@ class Odometry:
         if failure is None:
             self._registered_s = scan.stamp_s
         self._odometry_at_scan = self._odometry
-
-
-def _information(pose: GaussianPose, axes: np.ndarray) -> FloatArray:
-    """Return the inverse of a covariance along some axes, shape (6, 6), zero elsewhere."""
-    block = np.ix_(axes, axes)
-    result = np.zeros((6, 6))
-    result[block] = np.linalg.inv(pose.covariance[block])
-    return result

@@ -821,12 +821,12 @@ def gauss_newton(
     is_sweep = len(lags) > 0 and lags.max() > 0.0
     axes = np.array([2, 3, 4]) if surfels.is_planar else np.arange(12 if is_sweep else 6)
     matched, fitting, weight, length = 0, 0, 1.0, np.inf
-    for _ in range(most):
+    for iteration in range(most):
         if is_sweep:
             carry_to_end(points, lags, moving, at_end)
         _move(pose, at_end, moved)
         # Near the end a point keeps its surfel: it could go back and forth for ever.
-        if length > _REMATCHED:
+        if iteration == 0 or (length > _REMATCHED and iteration < 2 * most // 3):
             _apply(pose, sensor, origin)
             match(surfels, moved, origin, surfel_of, hits)
         matched, fitting = linearize(
