@@ -43,10 +43,11 @@ _MAX_ITERATIONS = 30
 _MAX_LAST_STEP = 5e-3
 # Of the points of a LiDAR, the coarse cells need one in so many only.
 _SPARSE = 4
-# Where the prediction leads nowhere, headings up to so far from it are tried; what is found must
-# explain so much of the scan.
+# Where the prediction explains less than half of the scan, and contradicts some of what the map
+# knows, headings up to so far from it are tried. What is found must explain half, and half as much
+# again as the prediction.
 _SEARCH_RAD = np.linspace(-0.6, 0.6, 13)
-_FOUND_SHARE = 0.5
+_FOUND_SHARE, _CONTRADICTED, _BETTER = 0.5, 0.9, 1.5
 # Normals are good to so many rad: a direction that is opposed by less than the square of it, as a
 # share of what opposes the best-known one, may be opposed by nothing else.
 _TILT = 0.1
@@ -170,9 +171,7 @@ class LocalMap:
             for times, spread in ((1, 1.0), (_COARSE, _COARSE_SIGMA))
         )
 
-    def register(
-        self, sweep: Sweep, prior: GaussianPose, motion: GaussianPose, *, least_share: float
-    ) -> Fit:
+    def register(self, sweep: Sweep, prior: GaussianPose, motion: GaussianPose) -> Fit:
         """Return where the scan fits, fused with what was expected.
 
         Where the scan does not fit near the prior, headings farther from it are tried.
@@ -181,16 +180,16 @@ class LocalMap:
             sweep: The scan, N >= 1.
             prior: `map_from_body` as predicted.
             motion: Motion during the sweep as predicted.
-            least_share: Share of points that must fit.
         """
         fit = self._fit(sweep, prior, motion, prior.mean)
-        if fit.inlier_share >= least_share:
+        if fit.inlier_share >= min(_FOUND_SHARE, _CONTRADICTED * fit.known_share):
             return fit
         turns = np.zeros((len(_SEARCH_RAD), 6))
         turns[:, 2] = _SEARCH_RAD
         others = [self._fit(sweep, prior, motion, prior.mean @ turn) for turn in exp(turns)]
         best = max(others, key=lambda other: other.inlier_share)
-        return best if best.inlier_share >= _FOUND_SHARE else fit
+        least = max(_FOUND_SHARE, _BETTER * fit.inlier_share)
+        return best if best.inlier_share >= least else fit
 
     def _fit(self, sweep: Sweep, prior: GaussianPose, motion: GaussianPose, start: Pose) -> Fit:
         axes = PLANAR_AXES if self._is_planar else np.arange(6)
@@ -295,7 +294,7 @@ def compile_kernels(*, is_planar: bool) -> None:
     seen = SeenPoints.of(points, sensor, cell_m=1.0, is_planar=is_planar)
     local_map = LocalMap(seen, cell_m=1.0, sigma_m=0.1, degenerate_m=1.0, is_planar=is_planar)
     sweep = Sweep(points, np.zeros(50) if is_planar else np.linspace(1.0, 0.0, 50), sensor)
-    local_map.register(sweep.thinned(0.1, 40), wide, wide, least_share=0.0)
+    local_map.register(sweep.thinned(0.1, 40), wide, wide)
 
 
 def compile_all_kernels() -> None:

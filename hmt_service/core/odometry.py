@@ -227,7 +227,7 @@ class Odometry:
             return predicted, None, TrackingFailure.TOO_FEW_POINTS
         if not self._sensor.is_planar:
             sweep = sweep.thinned(_REGISTERED_CELLS * config.voxel_size_m, config.max_points)
-        fit = self._map.register(sweep, predicted, motion, least_share=config.min_inlier_share)
+        fit = self._map.register(sweep, predicted, motion)
         failure = self._failure_of(fit, predicted)
         if failure is not None:
             return predicted, fit, failure

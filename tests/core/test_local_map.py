@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import chi2
 
+from hmt_service.core import local_map as module
 from hmt_service.core.geometry import (
     FloatArray,
     GaussianPose,
@@ -106,10 +107,9 @@ def registered(
     prior: GaussianPose,
     *,
     motion: GaussianPose | None = None,
-    least_share: float = 0.3,
 ) -> Fit:
     motion = motion or GaussianPose(identity(), isotropic_covariance(sigma_rad=0.1, sigma_m=0.3))
-    return local_map.register(sweep, prior, motion, least_share=least_share)
+    return local_map.register(sweep, prior, motion)
 
 
 def error_of(pose: Pose, truth: Pose) -> FloatArray:
@@ -368,15 +368,18 @@ def test_pose_is_the_product_of_scan_and_prior() -> None:
 
 
 @pytest.mark.parametrize("turn_rad", [-0.5, 0.5])
-def test_heading_that_is_half_a_radian_wrong_is_found(turn_rad: float) -> None:
+def test_heading_that_is_half_a_radian_wrong_is_found(
+    turn_rad: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
     truth = planar_pose(0.3, -0.3, 0.2)
     sweep = instant(points_from(ROOM, truth))
     prior = believed(
         truth @ planar_pose(0.0, 0.0, turn_rad), sigma_rad=0.05, sigma_m=0.05, is_planar=True
     )
-    # Without a search it is not: no share is too small.
-    missed = registered(ROOM_MAP, sweep, prior, least_share=0.0)
-    found = registered(ROOM_MAP, sweep, prior, least_share=missed.inlier_share + 1e-6)
+    found = registered(ROOM_MAP, sweep, prior)
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "_FOUND_SHARE", 0.0)  # nothing is searched for
+        missed = registered(ROOM_MAP, sweep, prior)
     assert abs(error_of(missed.pose, truth)[2]) > 0.1
     assert np.abs(error_of(found.pose, truth)[[2, 3, 4]]).max() < 0.02
     assert found.inlier_share > 0.8
