@@ -18,6 +18,8 @@ from hmt_service.core.geometry import (
     FloatArray,
     GaussianPose,
     Pose,
+    certain,
+    identity,
     inverse,
     isotropic_covariance,
     log,
@@ -27,12 +29,15 @@ from hmt_service.core.geometry import (
     transform_points,
     yaw_of,
 )
-from hmt_service.core.registration import covariance_of
 from hmt_service.core.submap import Visit
 
 # A prior this tight leaves one basin of attraction: registration finds it without a search.
 _SINGLE_BASIN_M = 0.25
 _SINGLE_BASIN_RAD = 0.05
+# How far a guess may be off; the prior of its registration, next to nothing.
+_BASIN_M, _BASIN_RAD = 1.0, 0.3
+# Standard deviation along a direction that the match says nothing about, m and rad.
+_UNSEEN = 10.0
 _SEPARATION_M = 0.6
 _SEPARATION_RAD = 0.15
 _SEPARATION_SIGMA = 4.0
@@ -74,38 +79,38 @@ class Aligner:
             Distinct modes, the one with most overlap first; empty when nothing agrees.
         """
         guesses = self._guesses(visit, target, prior)
-        refined = [mode for guess in guesses if (mode := self.refine(visit, target, guess))]
+        least = self._config.min_overlap
+        refined = [
+            mode
+            for guess in guesses
+            if (mode := self.refine(visit, target, guess, min_overlap=least))
+        ]
         refined = [mode for mode in refined if self._is_in_gate(mode, prior)]
         return self._distinct(refined)
 
-    def refine(self, visit: Visit, target: Visit, guess: Pose) -> Mode | None:
-        """Return the mode whose basin a guess lies in, or None when the submaps disagree there."""
-        config = self._config
-        pose = guess
-        # Coarse to fine: the first pass bridges the raster, the second the voxel.
-        for target_map, reach_m in (
-            (target.coarse_map, 4.0 * config.inlier_m),
-            (target.registration_map, 1.5 * config.inlier_m),
-        ):
-            registered = target_map.register(
-                visit.points, pose, max_correspondence_m=reach_m, kernel_m=0.3 * reach_m
-            )
-            if registered is None:
-                return None
-            pose = registered
-        match = target.registration_map.match(visit.points, pose, inlier_m=config.inlier_m)
-        if match.inlier_share < config.min_overlap:
+    def refine(
+        self, visit: Visit, target: Visit, guess: Pose, *, min_overlap: float
+    ) -> Mode | None:
+        """Return the mode whose basin a guess lies in, or None when the submaps disagree there.
+
+        Args:
+            visit: What is to be placed.
+            target: Where it is.
+            guess: Pose to start from, `target_from_visit`.
+            min_overlap: Least share of the visit's points that the target must explain.
+        """
+        near = isotropic_covariance(sigma_rad=_BASIN_RAD, sigma_m=_BASIN_M)
+        prior = GaussianPose(guess, planar_covariance(near) if self._is_planar else near)
+        fit = target.local_map.fit(visit.sweep, prior, certain(identity()), guess)
+        if not fit.is_converged or fit.inlier_share < min_overlap:
             return None
-        covariance = covariance_of(
-            match.information, sigma_m=self._covariance.sigma_submap_m, is_planar=self._is_planar
-        )
         floor = self._covariance
-        covariance += isotropic_covariance(
+        covariance = fit.own_covariance(_UNSEEN) + isotropic_covariance(
             sigma_rad=floor.floor_submap_rad, sigma_m=floor.floor_submap_m
         )
         if self._is_planar:
             covariance = planar_covariance(covariance)
-        return Mode(GaussianPose(pose, covariance), match.inlier_share)
+        return Mode(GaussianPose(fit.pose, covariance), fit.inlier_share)
 
     def _guesses(self, visit: Visit, target: Visit, prior: GaussianPose) -> list[Pose]:
         sigmas = np.sqrt(np.diag(prior.covariance))

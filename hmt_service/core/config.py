@@ -45,8 +45,6 @@ class OdometryConfig(Section):
 
     voxel_size_m: float = Field(default=0.1, gt=0.0)
     """Edge of the cells of local maps and submaps; the finest surface is three wide."""
-    points_per_voxel: int = Field(default=20, ge=1)
-    """Most points of a submap kept in one cell."""
     max_points: int = Field(default=2000, ge=100)
     """Most points of a LiDAR scan that are registered, evenly chosen."""
     window_keyframes: int = Field(default=40, ge=1)
@@ -102,12 +100,15 @@ class CovarianceConfig(Section):
     """Least standard deviation of a registered translation."""
     floor_rad: float = Field(default=0.0001, gt=0.0)
     """Least standard deviation of a registered rotation."""
+    drift_share: float = Field(default=0.08, ge=0.0, le=1.0)
+    """Share of the variance of a registration that stays in the local map and adds up along the
+    path; the rest is the noise of one scan. Fitted in simulated worlds."""
     degenerate_m: float = Field(default=0.05, gt=0.0)
     """A direction that a scan alone knows less well than this is left to the motion prior."""
     uneven_motion_share: float = Field(default=0.2, ge=0.0)
     """Standard deviation of the pose of a sweep because its motion is not uniform: as a share of
     its turn, and of the change of speed since the sweep before. Fitted in simulated worlds."""
-    sigma_submap_m: float = Field(default=0.1, gt=0.0)
+    sigma_submap_m: float = Field(default=0.04, gt=0.0)
     """Standard deviation of one residual between two submaps: they are bent as well as noisy."""
     floor_submap_m: float = Field(default=0.015, gt=0.0)
     """Least standard deviation of the translation between two submaps."""
@@ -141,8 +142,6 @@ class AlignmentConfig(Section):
     """Most poses kept per pair of submaps."""
     min_overlap: float = Field(default=0.45, ge=0.0, le=1.0)
     """Least share of a visit's submap that the other must explain at a pose."""
-    inlier_m: float = Field(default=0.2, gt=0.0)
-    """Distance below which a point counts as explained."""
 
 
 class TransitionConfig(Section):
@@ -165,6 +164,8 @@ class RefinementConfig(Section):
     """Most visits that one visit is tied to."""
     max_gap_m: float = Field(default=2.0, ge=0.0)
     """Farthest that the nearest points of the two paths may be apart."""
+    min_overlap: float = Field(default=0.2, ge=0.0, le=1.0)
+    """Least share of a visit's submap that the other must explain where the graph has put it."""
     max_sigma_m: float = Field(default=0.5, gt=0.0)
     """Largest standard deviation of the relative position: beyond it, the topology is in doubt."""
     max_sigma_rad: float = Field(default=0.1, gt=0.0)
@@ -252,7 +253,7 @@ _PRESETS: dict[Preset, dict[str, Any]] = {
         },
         "motion": {"max_speed_m_s": 50.0},
         "areas": {"cell_size_m": 1.0},
-        "alignment": {"raster_m": 0.5, "inlier_m": 0.6},
+        "alignment": {"raster_m": 0.5},
         "observation": {"hit_sigma_m": 0.4, "angular_resolution_rad": 0.035},
     },
     Preset.INDOOR: {
@@ -270,7 +271,7 @@ _PRESETS: dict[Preset, dict[str, Any]] = {
             "max_correction_m": 2.0,
         },
         "areas": {"cell_size_m": 0.5},
-        "alignment": {"raster_m": 0.25, "inlier_m": 0.3},
+        "alignment": {"raster_m": 0.25},
         "observation": {"hit_sigma_m": 0.2, "angular_resolution_rad": 0.035},
     },
 }

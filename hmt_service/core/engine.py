@@ -25,6 +25,7 @@ from hmt_service.core.hypotheses import Assignment, Hypothesis, ParticleLayer
 from hmt_service.core.observation import ObservationModel
 from hmt_service.core.plausibility import Plausibility
 from hmt_service.core.refinement import Refinement
+from hmt_service.core.smoothing import Smoother
 from hmt_service.core.stored import (
     StoredAssignment,
     StoredFactor,
@@ -74,6 +75,7 @@ class Engine:
         self._observation = ObservationModel(config.observation, config.sensor)
         self._transition = Transition(config, aligner, self._observation, rng)
         self._refinement = Refinement(config, aligner)
+        self._smoother = Smoother(config)
         self._particles = ParticleLayer(
             budget=config.particles.budget,
             negligible_mass=config.particles.negligible_mass,
@@ -87,6 +89,7 @@ class Engine:
         self._next_hypothesis = 0
         self._revision = 0
         self._finished_revision = 0
+        self._smoothed_revision = 0
 
     # ------------------------------------------------------------------ from scans to hypotheses
 
@@ -149,8 +152,13 @@ class Engine:
         )
         return None if split is None else split.first_of_new
 
-    def finish(self) -> tuple[Event, ...]:
-        """Refine what the last visit says; more trackings may follow, and twice is as good as once.
+    def finish(self, *, is_urgent: bool = False) -> tuple[Event, ...]:
+        """Refine what the last visit says, and smooth the trajectory of the best hypothesis.
+
+        More trackings may follow, and twice is as good as once.
+
+        Args:
+            is_urgent: Whether there is no time to smooth.
 
         Returns:
             What was decided.
@@ -159,6 +167,9 @@ class Engine:
             self._refine(self._open)
             self._revision += 1
             self._finished_revision = self._revision
+        if self._visits and not is_urgent and self._smoothed_revision < self._revision:
+            self._smoothed = self._smoother.smooth(self._particles.best, self._visits)
+            self._smoothed_revision = self._revision
         return ()
 
     @property
@@ -410,22 +421,18 @@ class Engine:
         )
 
     def trajectory(self) -> tuple[StampedPose, ...]:
-        """Return the globally consistent pose of every scan in the most probable hypothesis."""
+        """Return the globally consistent pose of every scan in the most probable hypothesis.
+
+        After `finish` they are smoothed; before, each keyframe is where its visit is.
+        """
         if not self._visits:
             return ()
-        graph = self._particles.best.graph
-        reference_from_keyframe: dict[int, Pose] = {}
-        for visit in self._visits.values():
-            reference_from_visit = graph.pose(visit.visit)
-            for keyframe, pose in zip(visit.keyframes, visit.visit_from_keyframe, strict=True):
-                reference_from_keyframe[keyframe.index] = reference_from_visit @ pose.mean
+        is_smooth = self._smoothed_revision == self._revision
+        poses = self._smoothed if is_smooth else self._particles.best.keyframe_poses(self._visits)
         return tuple(
-            StampedPose(
-                scan.stamp_s,
-                reference_from_keyframe[scan.keyframe_index] @ scan.keyframe_from_body,
-            )
+            StampedPose(scan.stamp_s, poses[scan.keyframe_index] @ scan.keyframe_from_body)
             for scan in self._scans
-            if scan.keyframe_index in reference_from_keyframe
+            if scan.keyframe_index < len(poses)
         )
 
     def stored(self) -> StoredMap:

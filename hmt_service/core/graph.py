@@ -8,7 +8,7 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import gtsam
@@ -107,6 +107,23 @@ class PoseGraph:
         self._poses: dict[int, Pose] = {}
         self._marginals: gtsam.Marginals | None = None
         self._is_solved = True
+
+    @classmethod
+    def of(
+        cls, poses: Sequence[Pose] | FloatArray, factors: Iterable[Factor], *, is_planar: bool
+    ) -> PoseGraph:
+        """Return a graph over nodes 0 to N - 1, the first of them the reference.
+
+        Args:
+            poses: Where to start, shape (N, 4, 4).
+            factors: Arcs between any two.
+            is_planar: Whether solved poses are kept planar exactly.
+        """
+        graph = cls(is_planar=is_planar)
+        graph._poses = dict(enumerate(poses))
+        for factor in factors:
+            graph.add_factor(factor)
+        return graph
 
     def copy(self) -> PoseGraph:
         """Return an independent graph that shares the factors, which are immutable."""

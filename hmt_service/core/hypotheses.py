@@ -11,7 +11,7 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -19,6 +19,7 @@ import numpy as np
 
 from hmt_service.core.geometry import FloatArray, GaussianPose, certain, identity
 from hmt_service.core.graph import Factor, PoseGraph
+from hmt_service.core.submap import Visit
 from hmt_service.core.types import HypothesisSummary
 
 
@@ -78,6 +79,15 @@ class Hypothesis:
         if area == visit:
             return certain(identity())
         return self.graph.relative(area, visit)
+
+    def keyframe_poses(self, visits: Mapping[int, Visit]) -> FloatArray:
+        """Return the pose of every keyframe in the frame of the first visit, shape (K, 4, 4)."""
+        poses = [
+            self.graph.pose(visit.visit) @ pose.mean
+            for visit in visits.values()
+            for pose in visit.visit_from_keyframe
+        ]
+        return np.array(poses)
 
     def extended(
         self,

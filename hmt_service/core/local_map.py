@@ -9,6 +9,7 @@ References:
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,6 +24,7 @@ from hmt_service.core.geometry import (
     identity,
     log,
     symmetric,
+    transform_points,
 )
 from hmt_service.core.surfels import (
     build_surfels,
@@ -63,8 +65,8 @@ class Sweep:
     """Shape (N, 3), m."""
     lags: FloatArray
     """Share of the sweep's motion that was still to come then, shape (N,); 0 at its end."""
-    sensor_in_body: FloatArray
-    """Position of the sensor, shape (3,), m."""
+    views: FloatArray
+    """Vector from each to where it was seen from, of any length, shape (N, 3)."""
 
     @property
     def is_instant(self) -> bool:
@@ -88,11 +90,13 @@ class Sweep:
         chosen = thin(self.points, cell_m)
         if len(chosen) > most:
             chosen = chosen[np.linspace(0, len(chosen) - 1, most).astype(np.int64)]
-        return Sweep(self.points[chosen], self.lags[chosen], self.sensor_in_body)
+        return Sweep(self.points[chosen], self.lags[chosen], self.views[chosen])
 
     def every(self, step: int) -> Sweep:
         """Return every so many-th point."""
-        return Sweep(self.points[::step].copy(), self.lags[::step].copy(), self.sensor_in_body)
+        return Sweep(
+            *(np.ascontiguousarray(a[::step]) for a in (self.points, self.lags, self.views))
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -103,6 +107,8 @@ class Fit:
     """`map_from_body` at the end of the sweep, fused with the prior, shape (4, 4)."""
     covariance: FloatArray
     """Of that, shape (6, 6); degenerate directions are as certain as the prior."""
+    scan_share: FloatArray
+    """The part of the covariance that is the scan's noise, not the prior's, shape (6, 6)."""
     motion: FloatArray
     """Motion during the sweep as a tangent vector, shape (6,)."""
     information: FloatArray
@@ -117,6 +123,15 @@ class Fit:
     """Share of the points that fit, in [0, 1]."""
     is_converged: bool
     """Whether the iteration came to rest."""
+
+    def own_covariance(self, unseen: float) -> FloatArray:
+        """Return the covariance of the pose by the scan alone, shape (6, 6).
+
+        Args:
+            unseen: Standard deviation where it says nothing, m and rad.
+        """
+        together: FloatArray = self.information + np.eye(6) / unseen**2
+        return symmetric(np.linalg.inv(together).astype(np.float64))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -135,6 +150,15 @@ class SeenPoints:
         """Return points as a sensor sees them."""
         cells_m = (cell_m, _COARSE * cell_m)
         return cls(points, directions_of(points, sensor_in_body, cells_m, is_planar=is_planar))
+
+    @classmethod
+    def together(cls, poses: Sequence[Pose], parts: Sequence[SeenPoints]) -> SeenPoints:
+        """Return what several have seen, each part carried by a pose, in one frame."""
+        posed = list(zip(poses, parts, strict=True))
+        return cls(
+            np.concatenate([transform_points(pose, part.points) for pose, part in posed]),
+            np.concatenate([part.directions @ pose[:3, :3].T for pose, part in posed]),
+        )
 
 
 class LocalMap:
@@ -181,17 +205,18 @@ class LocalMap:
             prior: `map_from_body` as predicted.
             motion: Motion during the sweep as predicted.
         """
-        fit = self._fit(sweep, prior, motion, prior.mean)
+        fit = self.fit(sweep, prior, motion, prior.mean)
         if fit.inlier_share >= min(_FOUND_SHARE, _CONTRADICTED * fit.known_share):
             return fit
         turns = np.zeros((len(_SEARCH_RAD), 6))
         turns[:, 2] = _SEARCH_RAD
-        others = [self._fit(sweep, prior, motion, prior.mean @ turn) for turn in exp(turns)]
+        others = [self.fit(sweep, prior, motion, prior.mean @ turn) for turn in exp(turns)]
         best = max(others, key=lambda other: other.inlier_share)
         least = max(_FOUND_SHARE, _BETTER * fit.inlier_share)
         return best if best.inlier_share >= least else fit
 
-    def _fit(self, sweep: Sweep, prior: GaussianPose, motion: GaussianPose, start: Pose) -> Fit:
+    def fit(self, sweep: Sweep, prior: GaussianPose, motion: GaussianPose, start: Pose) -> Fit:
+        """Return where the scan fits near a pose, as `register` does."""
         axes = PLANAR_AXES if self._is_planar else np.arange(6)
         block = np.ix_(axes, axes)
         prior_information = np.zeros((6, 6))
@@ -210,7 +235,7 @@ class LocalMap:
                 surfels,
                 np.ascontiguousarray(cloud.points),
                 cloud.lags,
-                cloud.sensor_in_body,
+                cloud.views,
                 pose,
                 expected,
                 prior_information,
@@ -230,9 +255,12 @@ class LocalMap:
         covariance = np.zeros((6, 6))
         together = known + weight * prior_information
         covariance[block] = symmetric(np.linalg.inv(together[block]))
+        # With S = (I + P)^-1: S = S I S + S P S, what the scan and what the prior adds to it.
+        scan_share = symmetric(covariance @ known @ covariance)
         return Fit(
             pose=pose,
             covariance=covariance,
+            scan_share=scan_share,
             motion=moving,
             information=known,
             degenerate=degenerate,
@@ -284,7 +312,7 @@ def deskew(points: FloatArray, point_times: FloatArray, motion: Pose) -> FloatAr
         point_times: When that was, as a share of the sweep in [0, 1], shape (N,).
         motion: Motion of the body during the sweep, shape (4, 4).
     """
-    return Sweep(points, 1.0 - point_times, np.zeros(3)).at_end(log(motion))
+    return Sweep(points, 1.0 - point_times, -points).at_end(log(motion))
 
 
 def compile_kernels(*, is_planar: bool) -> None:
@@ -293,7 +321,8 @@ def compile_kernels(*, is_planar: bool) -> None:
     sensor, wide = np.zeros(3), GaussianPose(identity(), np.eye(6))
     seen = SeenPoints.of(points, sensor, cell_m=1.0, is_planar=is_planar)
     local_map = LocalMap(seen, cell_m=1.0, sigma_m=0.1, degenerate_m=1.0, is_planar=is_planar)
-    sweep = Sweep(points, np.zeros(50) if is_planar else np.linspace(1.0, 0.0, 50), sensor)
+    lags = np.zeros(50) if is_planar else np.linspace(1.0, 0.0, 50)
+    sweep = Sweep(points, lags, sensor - points)
     local_map.register(sweep.thinned(0.1, 40), wide, wide)
 
 

@@ -25,7 +25,6 @@ from hmt_service.core.geometry import (
     planar_covariance,
     project_planar,
     symmetric,
-    transform_points,
 )
 from hmt_service.core.local_map import Fit, LocalMap, SeenPoints, Sweep, compile_kernels
 from hmt_service.core.surfels import thin
@@ -132,11 +131,19 @@ class Odometry:
         )
         sweep_motion = log(expected.mean) if fit is None else fit.motion
         error = self._error_of(sweep, sweep_motion, log(expected.mean))
+        if fit is not None and failure is None:
+            # Half, because the keyframe has as much: most of a step's error is that of its ends.
+            noise = 0.5 * (1.0 - self._covariance.drift_share) * fit.scan_share
+            error, drift = error + noise, posed.covariance - 2.0 * noise
+            if len(self._window) == 1:
+                drift = drift + noise  # the first keyframe had nothing to be registered in
+        else:
+            drift = posed.covariance
         registration = None if fit is None else self._registration(fit, motion)
         self._remember_motion(posed.mean, elapsed_s, sweep_motion)
         self._failures = 0 if failure is None else self._failures + 1
         # What is said of the pose holds what is wrong with the keyframe and with this scan.
-        told = GaussianPose(identity(), self._keyframe_error) @ posed
+        told = GaussianPose(identity(), self._keyframe_error) @ GaussianPose(posed.mean, drift)
         told = self._confined(GaussianPose(told.mean, told.covariance + error))
         if self._is_keyframe(posed.mean, len(sweep.points), registration, failure):
             if failure is not None and not self._has_new_odometry:
@@ -211,7 +218,7 @@ class Odometry:
         if not self._sensor.is_planar and len(points):
             kept = thin(points, _KEPT_CELLS * self._config.voxel_size_m)
             points, lags = points[kept], lags[kept]
-        return Sweep(points, lags, scan.sensor_in_body), share
+        return Sweep(points, lags, scan.sensor_in_body - points), share
 
     # ------------------------------------------------------------------ what the scan says
 
@@ -328,6 +335,7 @@ class Odometry:
             points_in_body=points.astype(np.float32),
             sensor_in_body=scan.sensor_in_body,
             previous_from_body=previous_from_body,
+            own_error=error,
             failure=failure,
         )
         # The local map has many keyframes: of each it needs one point per cell.
@@ -355,12 +363,7 @@ class Odometry:
         self._window.clear()
         self._window.extend([*kept, (identity(), seen)])
         self._map = LocalMap(
-            SeenPoints(
-                np.concatenate(
-                    [transform_points(pose, each.points) for pose, each in self._window]
-                ),
-                np.concatenate([each.directions @ pose[:3, :3].T for pose, each in self._window]),
-            ),
+            SeenPoints.together(*zip(*self._window, strict=True)),
             cell_m=self._config.voxel_size_m,
             sigma_m=self._covariance.sigma_m,
             degenerate_m=self._covariance.degenerate_m,

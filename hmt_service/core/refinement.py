@@ -54,7 +54,9 @@ class Refinement:
             prior = hypothesis.graph.relative(other, visit.visit)
             if not self._is_certain(prior):
                 continue
-            mode = self._aligner.refine(visit, visits[other], prior.mean)
+            mode = self._aligner.refine(
+                visit, visits[other], prior.mean, min_overlap=self._config.min_overlap
+            )
             if mode is not None and self._agrees(prior, mode):
                 ties.append((other, mode))
         if not ties:

@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 
@@ -26,9 +27,13 @@ from hmt_service.core.geometry import (
     identity,
     transform_points,
 )
-from hmt_service.core.registration import RegistrationMap, voxel_downsample
+from hmt_service.core.local_map import LocalMap, SeenPoints, Sweep
+from hmt_service.core.surfels import thin
 from hmt_service.core.transients import without_transients
 from hmt_service.core.types import Keyframe, Points
+
+# Size of the cells that a submap keeps one point of, over those of the local map.
+_SUBMAP_CELLS = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,9 +67,32 @@ class Visit:
     @cached_property
     def points(self) -> FloatArray:
         """Submap: what stood still, in the visit's frame, one point per voxel, shape (N, 3), m."""
+        return self.seen.points
+
+    @cached_property
+    def seen(self) -> SeenPoints:
+        """The submap, with the side that each point was seen from."""
+        cell_m, is_planar = self.config.odometry.voxel_size_m, self.config.sensor.is_planar
         poses = [pose.mean for pose in self.visit_from_keyframe]
         clouds = without_transients(self.keyframes, poses, self.config)
-        return voxel_downsample(np.concatenate(clouds), 0.5 * self.config.odometry.voxel_size_m)
+        sensors = [
+            transform_points(pose, keyframe.sensor_in_body[None])[0]
+            for keyframe, pose in zip(self.keyframes, poses, strict=True)
+        ]
+        seen = [
+            SeenPoints.of(cloud, sensor, cell_m=cell_m, is_planar=is_planar)
+            for cloud, sensor in zip(clouds, sensors, strict=True)
+        ]
+        whole = SeenPoints.together([identity()] * len(seen), seen)
+        kept = thin(whole.points, _SUBMAP_CELLS * cell_m)
+        return SeenPoints(whole.points[kept], whole.directions[kept])
+
+    @cached_property
+    def sweep(self) -> Sweep:
+        """What of the submap is registered in others: one point per voxel, and not too many."""
+        whole = Sweep(self.points, np.zeros(len(self.points)), self.seen.directions)
+        odometry = self.config.odometry
+        return whole.thinned(odometry.voxel_size_m, 2 * odometry.max_points)
 
     @cached_property
     def novelty(self) -> tuple[float, ...]:
@@ -84,20 +112,13 @@ class Visit:
         return transform_points(frame_from_visit, self.points)
 
     @cached_property
-    def registration_map(self) -> RegistrationMap:
-        """The submap, ready to register against."""
-        return self._registration_map(self.config.odometry.voxel_size_m)
-
-    @cached_property
-    def coarse_map(self) -> RegistrationMap:
-        """The same in voxels as wide as the first guess may be off: ICP sees one voxel far."""
-        return self._registration_map(2.0 * self.config.alignment.inlier_m)
-
-    def _registration_map(self, voxel_m: float) -> RegistrationMap:
-        return RegistrationMap(
-            self.points,
-            voxel_m=voxel_m,
-            points_per_voxel=self.config.odometry.points_per_voxel,
+    def local_map(self) -> LocalMap:
+        """The submap, ready to register others in it."""
+        return LocalMap(
+            self.seen,
+            cell_m=self.config.odometry.voxel_size_m,
+            sigma_m=self.config.covariance.sigma_submap_m,
+            degenerate_m=self.config.covariance.degenerate_m,
             is_planar=self.config.sensor.is_planar,
         )
 
@@ -120,7 +141,7 @@ class Visit:
 
     def with_keyframe(self, keyframe: Keyframe) -> Visit:
         """Return this visit, longer by one keyframe."""
-        pose = self.visit_from_keyframe[-1] @ keyframe.previous_from_body
+        pose = _chained(self.visit_from_keyframe[-1], self.keyframes[-1], keyframe)
         return Visit(
             self.visit,
             (*self.keyframes, keyframe),
@@ -143,15 +164,27 @@ class Visit:
             self.config,
         )
         later = visit_of(self.visit + 1, self.keyframes[first_of_new:], self.config)
-        last_from_new = self.keyframes[first_of_new].previous_from_body
-        return earlier, later, earlier.visit_from_keyframe[-1] @ last_from_new
+        last, new = earlier.keyframes[-1], later.keyframes[0]
+        return earlier, later, _chained(earlier.visit_from_keyframe[-1], last, new)
+
+
+def _chained(visit_from_last: GaussianPose, last: Keyframe, new: Keyframe) -> GaussianPose:
+    """Return the pose of the keyframe after the last one, in the frame of the visit.
+
+    What is wrong with the last keyframe alone was in its own pose, and is in the motion from it
+    with opposite sign: it cancels. The first keyframe's own pose is exact by definition.
+    """
+    is_first = not np.any(visit_from_last.covariance)
+    cancelled = 0.0 if is_first else 2.0 * last.own_error
+    kept = GaussianPose(visit_from_last.mean, visit_from_last.covariance - cancelled)
+    return kept @ new.previous_from_body
 
 
 def visit_of(visit: int, keyframes: Sequence[Keyframe], config: Config) -> Visit:
     """Return a visit made of these keyframes, in the frame of the first of them."""
     poses = [certain(identity())]
-    for keyframe in keyframes[1:]:
-        poses.append(poses[-1] @ keyframe.previous_from_body)
+    for last, keyframe in pairwise(keyframes):
+        poses.append(_chained(poses[-1], last, keyframe))
     cells = tuple(
         _cells(keyframe, pose.mean, config) for keyframe, pose in zip(keyframes, poses, strict=True)
     )

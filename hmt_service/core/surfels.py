@@ -504,22 +504,30 @@ def _match(surfels: Surfels, x: float, y: float, z: float, view: FloatArray) -> 
 
 @njit(cache=True)
 def match(
-    surfels: Surfels, moved: FloatArray, origin: FloatArray, surfel_of: Indices, hits: Indices
+    surfels: Surfels,
+    moved: FloatArray,
+    pose: FloatArray,
+    views: FloatArray,
+    surfel_of: Indices,
+    hits: Indices,
 ) -> None:
     """Fill in the surfel that each point lies on, -1 for none, and how many lie on each surfel.
 
     Args:
         surfels: The map.
         moved: Points in its frame, shape (N, 3), m.
-        origin: Position of the sensor in its frame, shape (3,), m.
+        pose: `map_from_body`, shape (4, 4).
+        views: Vector from each point to the sensor in the body frame, shape (N, 3).
         surfel_of: Filled in, shape (N,).
         hits: Filled in, shape (S,).
     """
     hits[:] = 0
     view = np.empty(3)
     for n in range(len(moved)):
-        for axis in range(3):
-            view[axis] = origin[axis] - moved[n, axis]
+        for row in range(3):
+            view[row] = (
+                pose[row, 0] * views[n, 0] + pose[row, 1] * views[n, 1] + pose[row, 2] * views[n, 2]
+            )
         surfel_of[n] = _match(surfels, moved[n, 0], moved[n, 1], moved[n, 2], view)
         if surfel_of[n] >= 0:
             hits[surfel_of[n]] += 1
@@ -775,7 +783,7 @@ def gauss_newton(
     surfels: Surfels,
     points: FloatArray,
     lags: FloatArray,
-    sensor: FloatArray,
+    views: FloatArray,
     start: FloatArray,
     prior: FloatArray,
     prior_information: FloatArray,
@@ -795,7 +803,7 @@ def gauss_newton(
         surfels: The map.
         points: Each in the body frame when it was taken, shape (N, 3), m.
         lags: Share of the sweep's motion that was still to come then, shape (N,).
-        sensor: Position of the sensor in the body, shape (3,), m.
+        views: Vector from each point to the sensor, of any length, shape (N, 3).
         start: `map_from_body` to start from, shape (4, 4).
         prior: The same as predicted.
         prior_information: Of the prediction, shape (6, 6).
@@ -816,7 +824,7 @@ def gauss_newton(
     hits = np.zeros(len(surfels.means), np.int64)
     surfel_of = np.empty(len(points), np.int64)
     pose, at_end, moving = start.copy(), points.copy(), motion.copy()
-    moved, origin, gap = np.empty(points.shape), np.empty(3), np.empty(6)
+    moved, gap = np.empty(points.shape), np.empty(6)
     difference, change = np.empty((4, 4)), np.empty((4, 4))
     is_sweep = len(lags) > 0 and lags.max() > 0.0
     axes = np.array([2, 3, 4]) if surfels.is_planar else np.arange(12 if is_sweep else 6)
@@ -827,8 +835,7 @@ def gauss_newton(
         _move(pose, at_end, moved)
         # Near the end a point keeps its surfel: it could go back and forth for ever.
         if iteration == 0 or (length > _REMATCHED and iteration < 2 * most // 3):
-            _apply(pose, sensor, origin)
-            match(surfels, moved, origin, surfel_of, hits)
+            match(surfels, moved, pose, views, surfel_of, hits)
         matched, fitting = linearize(
             surfels, at_end, lags, pose, moved, surfel_of, hits, kernel2, information, gradient
         )

@@ -94,6 +94,9 @@ class Keyframe:
     """Position of the sensor, shape (3,), m."""
     previous_from_body: GaussianPose
     """Motion since the keyframe before; identity for the first."""
+    own_error: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
+    """Covariance of what is wrong with this keyframe alone, shape (6, 6): part of the motion to it
+    and of the motion from it, where it cancels. It does not add up along the path."""
     failure: TrackingFailure | None = None
     """Set when the motion was guessed (odometry or constant velocity), not registered."""
 

@@ -34,7 +34,7 @@ from hmt_service.core.stored import (
 from hmt_service.core.types import Keyframe, Points, TrackingFailure
 from hmt_service.errors import InvalidInput, NotFound, Unavailable
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 """Version of the tables, in `PRAGMA user_version`."""
 POINT_RESOLUTION_M = 0.005
 """Edge of the grid that points are rounded to."""
@@ -45,7 +45,8 @@ _SCHEMA = """
 CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL) STRICT;
 CREATE TABLE keyframes (
     keyframe INTEGER NOT NULL UNIQUE, stamp_s REAL NOT NULL, sensor_in_body BLOB NOT NULL,
-    previous_from_body BLOB NOT NULL, failure TEXT, points_in_body BLOB NOT NULL
+    previous_from_body BLOB NOT NULL, own_error BLOB NOT NULL, failure TEXT,
+    points_in_body BLOB NOT NULL
 ) STRICT;
 CREATE TABLE scans (
     stamp_s REAL NOT NULL, keyframe INTEGER NOT NULL, keyframe_from_body BLOB NOT NULL
@@ -156,6 +157,7 @@ def _write(database: sqlite3.Connection, stored: StoredMap) -> None:
                 keyframe.stamp_s,
                 _numbers_blob(keyframe.sensor_in_body),
                 _gaussian_blob(keyframe.previous_from_body),
+                _numbers_blob(keyframe.own_error.ravel()),
                 keyframe.failure,
                 _points_blob(keyframe.points_in_body, compressor),
             )
@@ -211,9 +213,12 @@ def _read(database: sqlite3.Connection) -> StoredMap:
             _points(points, resolution_m, decompressor),
             _numbers(sensor),
             _gaussian(motion),
+            _numbers(own_error).reshape(6, 6),
             None if failure is None else TrackingFailure(failure),
         )
-        for index, stamp_s, sensor, motion, failure, points in _rows(database, "keyframes")
+        for index, stamp_s, sensor, motion, own_error, failure, points in _rows(
+            database, "keyframes"
+        )
     )
     scans = tuple(
         StoredScan(stamp_s, index, _pose(pose)) for stamp_s, index, pose in _rows(database, "scans")

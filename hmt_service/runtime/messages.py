@@ -56,6 +56,8 @@ class Finish:
 
     number: int
     """Grows with every one."""
+    is_urgent: bool = False
+    """Whether there is no time to smooth the trajectory."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

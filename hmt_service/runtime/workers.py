@@ -103,7 +103,7 @@ class _Topology:
     def finish(self, finish: Finish) -> Mapped:
         """Complete the map and save it."""
         started = time.perf_counter()
-        events = self._engine.finish()
+        events = self._engine.finish(is_urgent=finish.is_urgent)
         self._busy_s += time.perf_counter() - started
         save = self._save
         saved = () if save is None else _guarded(lambda: save(self._engine, self._report()))

@@ -147,7 +147,7 @@ def _finish(gateway: Gateway, pipeline: Pipeline, *, is_broken: bool) -> Finishe
         return None
     started_s = time.monotonic()
     finished: Future[Finished] = Future()
-    gateway.finish(finished.set_result)
+    gateway.finish(finished.set_result, is_urgent=True)
     is_bypassed = False
     while not finished.done() and (elapsed_s := time.monotonic() - started_s) < _SAVE_S:
         if not pipeline.is_alive(ProcessName.TOPOLOGY):

@@ -146,20 +146,21 @@ class Gateway:
             self._reported_s = now
             self._report_refused()
 
-    def finish(self, on_finished: Callable[[Finished], None]) -> None:
+    def finish(self, on_finished: Callable[[Finished], None], *, is_urgent: bool = False) -> None:
         """Process what has arrived, complete the map and save it; input may follow.
 
         Args:
             on_finished: Called once with the outcome, from any thread.
+            is_urgent: Whether there is no time to smooth the trajectory.
         """
         with self._lock:
             self._finishes += 1
             self._on_finished[self._finishes] = on_finished
-            self._intake.finish(Finish(self._finishes))
+            self._intake.finish(Finish(self._finishes, is_urgent))
 
     def finish_map(self) -> None:
         """Do the same with the scans that the topology has: nothing comes through the odometry."""
-        self._pipeline.finish_map(Finish(self._finishes))
+        self._pipeline.finish_map(Finish(self._finishes, is_urgent=True))
 
     def discard(self) -> None:
         """Throw away what waits to be decoded."""

@@ -98,7 +98,7 @@ def believed(
 
 
 def instant(points: FloatArray) -> Sweep:
-    return Sweep(points, np.zeros(len(points)), CENTRE)
+    return Sweep(points, np.zeros(len(points)), CENTRE - points)
 
 
 def registered(
@@ -182,7 +182,7 @@ def test_pose_and_motion_of_a_sweep_are_recovered(
     truth = start @ exp(moved)
     fit = registered(
         HALL_MAP,
-        Sweep(points, 1.0 - times, CENTRE).thinned(0.3, 3000),
+        Sweep(points, 1.0 - times, CENTRE - points).thinned(0.3, 3000),
         believed(start @ exp(guessed_share * moved), is_planar=False),
         motion=believed(exp(guessed_share * moved), is_planar=False),
     )
@@ -208,7 +208,7 @@ def test_motion_that_is_not_accounted_for_would_cost_half_of_it() -> None:
 def test_sweep_at_its_end_is_a_picture_of_the_room() -> None:
     start, moved = SPATIAL_PATH[1], np.array([0.04, -0.05, 0.25, 0.3, 0.1, -0.05])
     points, times = sweep_from(start, moved, pillars=NO_PILLARS)
-    sweep = Sweep(points, 1.0 - times, CENTRE)
+    sweep = Sweep(points, 1.0 - times, CENTRE - points)
 
     def off_walls_m(points_in_body: FloatArray) -> float:
         moved_points = transform_points(start @ exp(moved), points_in_body)
@@ -405,7 +405,7 @@ def test_scan_of_another_place_fits_nowhere() -> None:
 def numbered(count: int) -> Sweep:
     """Return a sweep in which the lag of each point follows from its position."""
     points = np.random.default_rng(20).uniform(-3.0, 3.0, (count, 3))
-    return Sweep(points, lag_of(points), np.array([0.1, 0.2, 0.3]))
+    return Sweep(points, lag_of(points), np.array([0.1, 0.2, 0.3]) - points)
 
 
 def lag_of(points: FloatArray) -> FloatArray:
@@ -418,7 +418,7 @@ def test_thinned_sweep_keeps_points_and_lags_together(most: int) -> None:
     thinned = sweep.thinned(0.5, most)
     assert len(thinned.points) == len(thinned.lags) <= most
     assert np.array_equal(thinned.lags, lag_of(thinned.points))
-    assert np.array_equal(thinned.sensor_in_body, sweep.sensor_in_body)
+    assert np.array_equal(thinned.views, np.array([0.1, 0.2, 0.3]) - thinned.points)
     cells = np.floor(thinned.points / 0.5)
     assert len(np.unique(cells, axis=0)) == len(cells)
     # Those that are kept of too many come from all of the sweep.
@@ -446,7 +446,7 @@ def test_same_scan_gives_the_same_bytes() -> None:
     def run() -> bytes:
         start, moved = SPATIAL_PATH[3], np.array([0.01, 0.02, 0.1, 0.2, 0.0, 0.0])
         points, times = sweep_from(start, moved, noise=np.random.default_rng(21))
-        sweep = Sweep(points, 1.0 - times, CENTRE).thinned(0.3, 2000)
+        sweep = Sweep(points, 1.0 - times, CENTRE - points).thinned(0.3, 2000)
         motion = certain(identity())
         motion = GaussianPose(motion.mean, isotropic_covariance(sigma_rad=0.2, sigma_m=0.4))
         fit = registered(

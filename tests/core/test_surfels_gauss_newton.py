@@ -81,7 +81,7 @@ def linearized(
     information, gradient = np.empty((12, 12)), np.empty(12)
     moved, found = transform_points(pose, points), np.empty(len(points), np.int64)
     hits = np.empty(len(surfels.means), np.int64)
-    match(surfels, moved, pose[:3, 3].copy(), found, hits)
+    match(surfels, moved, pose, -points, found, hits)
     matched, fitting = compiled.linearize(
         surfels, points, lags, pose, moved, found, hits, kernel2, information, gradient
     )
@@ -168,7 +168,7 @@ def test_same_points_give_the_same_bytes() -> None:
         surfels = surfels_of(points, np.zeros(3))
         pose = exp(np.full(6, 0.01))
         pose, motion, information, *_ = compiled.gauss_newton(
-            surfels, points, 1.0 - times, np.zeros(3), pose, identity(), np.eye(6), 12.6,
+            surfels, points, 1.0 - times, -points, pose, identity(), np.eye(6), 12.6,
             np.zeros(6), np.eye(6), 16.0, 10,
         )  # fmt: skip
         matches = matches_of(surfels, points[::99], -points[::99])

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from hmt_service.core.config import Preset, load_config
+from hmt_service.core.config import Config, Preset, load_config
 from hmt_service.core.geometry import (
     FloatArray,
     Pose,
@@ -20,8 +20,8 @@ from hmt_service.core.geometry import (
     transform_points,
 )
 from hmt_service.core.local_map import deskew
-from hmt_service.core.registration import voxel_downsample
 from hmt_service.core.submap import visit_of
+from hmt_service.core.surfels import thin
 from hmt_service.core.transients import without_transients
 from hmt_service.core.types import Keyframe, Points, Scan
 from hmt_service.sim.simulation import Instant, simulate
@@ -240,16 +240,18 @@ def is_inside(points: FloatArray, bounds: FloatArray) -> Mask:
     return np.asarray(((points >= bounds[0] - 1e-3) & (points <= bounds[1] + 1e-3)).all(axis=1))
 
 
+def thinned(points: FloatArray, config: Config) -> FloatArray:
+    """Return what a keyframe keeps of the points of a LiDAR."""
+    return np.asarray(points[thin(points, 0.5 * config.odometry.voxel_size_m)])
+
+
 def test_lidar_forgets_who_walks_by_and_keeps_posts_and_walls() -> None:
     mount = np.array([0.0, 0.0, 0.8])
     path = [planar_pose(0.5 * i, 0.0, 0.0) for i in range(14)]
     post, table = upright(5.0, 1.5, 0.08, 2.5), upright(3.0, -2.0, 0.6, 0.7)
     people = [upright(8.0 - 0.4 * i, -1.0, 0.4) for i in range(len(path))]
     clouds = [
-        voxel_downsample(
-            rows_from([post, table, person], pose[:3, 3] + mount) + mount,
-            0.5 * INDOOR.odometry.voxel_size_m,
-        )
+        thinned(rows_from([post, table, person], pose[:3, 3] + mount) + mount, INDOOR)
         for pose, person in zip(path, people, strict=True)
     ]
     stay = without_transients(keyframes_of(clouds, path, mount), path, INDOOR)
@@ -291,7 +293,7 @@ def drive_of(family: Family, scans: int, people: int) -> tuple[list[Keyframe], l
         if scan.point_times is not None:
             points = deskew(points, scan.point_times, motion)
             people_in_body = points[is_person]
-            points = voxel_downsample(points, 0.5 * config.odometry.voxel_size_m)
+            points = thinned(points, config)
             is_person = is_among(points, people_in_body)
         mean = certain(step if keyframes else identity())
         stored: Points = points.astype(np.float32)

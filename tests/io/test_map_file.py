@@ -50,6 +50,7 @@ def random_map(
                 rng.normal(0.0, 20.0, (points, 3)).astype(np.float32),
                 rng.normal(0.0, 1.0, 3),
                 random_gaussian(rng),
+                rng.normal(size=(6, 6)),
                 failures[index % len(failures)],
             )
             for index in range(keyframes)
@@ -100,6 +101,7 @@ def assert_same_map(read: StoredMap, written: StoredMap) -> None:
         assert keyframe.failure is other.failure
         assert np.array_equal(keyframe.sensor_in_body, other.sensor_in_body)
         assert_same_gaussian(keyframe.previous_from_body, other.previous_from_body)
+        assert np.array_equal(keyframe.own_error, other.own_error)
         assert keyframe.points_in_body.dtype == np.float32
         assert keyframe.points_in_body.shape == other.points_in_body.shape
         assert keyframe.points_in_body == pytest.approx(

@@ -1,0 +1,127 @@
+"""Smoothing of all keyframes: what is bent becomes straight, what is not there is left."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hmt_service.core.config import load_config
+from hmt_service.core.geometry import (
+    GaussianPose,
+    Pose,
+    exp,
+    identity,
+    inverse,
+    planar_covariance,
+    planar_pose,
+)
+from hmt_service.core.graph import Factor, PoseGraph
+from hmt_service.core.hypotheses import Assignment, Hypothesis
+from hmt_service.core.smoothing import Smoother
+from hmt_service.core.submap import Visit, visit_of
+from tests.core.factories import ROOM, keyframes_along, motion_covariance
+
+CONFIG = load_config(text="odometry: {window_keyframes: 3}")
+OUT = [planar_pose(-1.0 + 0.25 * i, 0.1 * i, 0.05 * i) for i in range(9)]
+PATH = [*OUT, *OUT[::-1]]
+STEP = motion_covariance(0.01, 0.03)
+
+
+def bent(path: Sequence[Pose], *, turn_rad: float) -> list[Visit]:
+    """Return two visits, there and back, whose motions all turn too far by so much."""
+    keyframes = keyframes_along(ROOM, path, noise=np.random.default_rng(4))
+    wrong = planar_pose(0.0, 0.0, turn_rad)
+    keyframes = [
+        replace(
+            keyframe,
+            previous_from_body=GaussianPose(keyframe.previous_from_body.mean @ wrong, STEP),
+        )
+        for keyframe in keyframes
+    ]
+    half = len(path) // 2
+    return [visit_of(0, keyframes[:half], CONFIG), visit_of(1, keyframes[half:], CONFIG)]
+
+
+def hypothesis_of(visits: Sequence[Visit]) -> Hypothesis:
+    there, back = visits
+    last = there.visit_from_keyframe[-1] @ back.keyframes[0].previous_from_body
+    graph = PoseGraph(is_planar=True)
+    graph.add_reference(0)
+    graph.add_factor(Factor(0, 1, last))
+    return Hypothesis(0, 0.0, (Assignment(0, 0, None), Assignment(1, 1, None)), graph)
+
+
+def errors_m(poses: Sequence[Pose] | np.ndarray, path: Sequence[Pose]) -> np.ndarray:
+    truth = np.array([inverse(path[0]) @ pose for pose in path])
+    return np.asarray(np.linalg.norm(np.asarray(poses)[:, :2, 3] - truth[:, :2, 3], axis=1))
+
+
+def smoothed(visits: Sequence[Visit]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the poses before and after."""
+    hypothesis, known = hypothesis_of(visits), {visit.visit: visit for visit in visits}
+    return hypothesis.keyframe_poses(known), Smoother(CONFIG).smooth(hypothesis, known)
+
+
+def test_a_bent_path_that_comes_back_becomes_straight() -> None:
+    before, after = smoothed(bent(PATH, turn_rad=0.008))
+    assert errors_m(before, PATH).max() > 0.1
+    # There and back agree; how the first way was bent is seen by the way back only.
+    assert errors_m(after, PATH).max() < 0.5 * errors_m(before, PATH).max()
+    for out, home in zip(after[:9], after[:8:-1], strict=True):
+        assert np.abs((inverse(out) @ home - identity())[:2]).max() < 0.02
+    assert np.array_equal(after[0], before[0])
+
+
+def test_a_path_that_never_comes_back_stays_as_it_is() -> None:
+    before, after = smoothed(bent([*OUT[:2], *OUT[2:4]], turn_rad=0.01))
+    assert np.array_equal(before, after)
+
+
+def test_what_has_moved_does_not_bend_the_map() -> None:
+    visits = bent(PATH, turn_rad=0.0)
+    there, back = visits
+    # Half of what one keyframe of the way back saw stands elsewhere.
+    moved = back.keyframes[4]
+    points = moved.points_in_body.copy()
+    points[: len(points) // 3] += np.float32(0.3)
+    keyframes = [*back.keyframes[:4], replace(moved, points_in_body=points), *back.keyframes[5:]]
+    _, after = smoothed([there, visit_of(1, keyframes, CONFIG)])
+    assert errors_m(after, PATH).max() < 0.03
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_planar_poses_stay_planar_and_the_same_bytes_come_twice(seed: int) -> None:
+    turn_rad = float(np.random.default_rng(seed).uniform(-0.01, 0.01))
+    visits = bent(PATH, turn_rad=turn_rad)
+    _, first = smoothed(visits)
+    _, second = smoothed(visits)
+    assert first.tobytes() == second.tobytes()
+    assert not first[:, 2, [0, 1, 3]].any()
+
+
+def test_own_errors_cancel_along_the_path() -> None:
+    own = planar_covariance(motion_covariance(0.002, 0.01))
+    drift = planar_covariance(motion_covariance(0.0005, 0.001))
+    keyframes = [
+        replace(
+            keyframe,
+            own_error=own,
+            previous_from_body=GaussianPose(identity(), drift + 2.0 * own),
+        )
+        for keyframe in keyframes_along(ROOM, [identity()] * 21)
+    ]
+    visit = visit_of(0, keyframes, CONFIG)
+    ends = 2.0 * own[3, 3]
+    for count in (1, 5, 20):
+        variance = visit.visit_from_keyframe[count].covariance[3, 3]
+        assert variance == pytest.approx(ends + count * drift[3, 3], rel=1e-6)
+    # Cut in two and joined again, it is the same.
+    earlier, later, motion = visit.split(10)
+    assert motion.covariance[3, 3] == pytest.approx(ends + 10 * drift[3, 3], rel=1e-6)
+    assert later.visit_from_keyframe[-1].covariance[3, 3] == pytest.approx(
+        ends + 10 * drift[3, 3], rel=1e-6
+    )
+    assert np.allclose(exp(np.zeros(6)), earlier.visit_from_keyframe[0].mean)
