@@ -18,6 +18,7 @@ from hmt_service.core.geometry import (
     FloatArray,
     GaussianPose,
     Pose,
+    adjoint,
     certain,
     identity,
     inverse,
@@ -104,9 +105,15 @@ class Aligner:
         fit = target.local_map.fit(visit.sweep, prior, certain(identity()), guess)
         if not fit.is_converged or fit.inlier_share < min_overlap:
             return None
-        floor = self._covariance
-        covariance = fit.own_covariance(_UNSEEN) + isotropic_covariance(
-            sigma_rad=floor.floor_submap_rad, sigma_m=floor.floor_submap_m
+        moved = adjoint(inverse(fit.pose))
+        covariance = (
+            fit.own_covariance(_UNSEEN)
+            + visit.bend
+            + moved @ target.bend @ moved.T
+            + isotropic_covariance(
+                sigma_rad=self._covariance.floor_submap_rad,
+                sigma_m=self._covariance.floor_submap_m,
+            )
         )
         if self._is_planar:
             covariance = planar_covariance(covariance)

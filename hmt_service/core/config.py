@@ -110,9 +110,9 @@ class CovarianceConfig(Section):
     its turn, and of the change of speed since the sweep before. Fitted in simulated worlds."""
     sigma_submap_m: float = Field(default=0.04, gt=0.0)
     """Standard deviation of one residual between two submaps: they are bent as well as noisy."""
-    floor_submap_m: float = Field(default=0.015, gt=0.0)
+    floor_submap_m: float = Field(default=0.005, gt=0.0)
     """Least standard deviation of the translation between two submaps."""
-    floor_submap_rad: float = Field(default=0.004, gt=0.0)
+    floor_submap_rad: float = Field(default=0.001, gt=0.0)
     """Least standard deviation of the rotation between two submaps."""
 
 

@@ -23,8 +23,10 @@ from hmt_service.core.geometry import (
     FloatArray,
     GaussianPose,
     Pose,
+    adjoint,
     certain,
     identity,
+    symmetric,
     transform_points,
 )
 from hmt_service.core.local_map import LocalMap, SeenPoints, Sweep
@@ -121,6 +123,19 @@ class Visit:
             degenerate_m=self.config.covariance.degenerate_m,
             is_planar=self.config.sensor.is_planar,
         )
+
+    @cached_property
+    def bend(self) -> FloatArray:
+        """Covariance of the visit's frame where its content is known, shape (6, 6).
+
+        What is aligned with another submap are the points that keyframes saw; how far the frame is
+        from there is as uncertain as their poses in it are, on average.
+        """
+        moved = [
+            adjoint(pose.mean) @ pose.covariance @ adjoint(pose.mean).T
+            for pose in self.visit_from_keyframe
+        ]
+        return symmetric(np.mean(moved, axis=0))
 
     @cached_property
     def centre(self) -> FloatArray:

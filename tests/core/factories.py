@@ -95,11 +95,13 @@ def gaussian(mean: Pose, *, sigma_rad: float = 0.01, sigma_m: float = 0.05) -> G
 def keyframes_along(
     walls: Walls, path: Sequence[Pose], *, first: int = 0, noise: np.random.Generator | None = None
 ) -> tuple[Keyframe, ...]:
-    """Return a keyframe at every pose, with the true motion between them."""
+    """Return a keyframe at every pose, with the true motion between them, as good as a scan's."""
     result = []
     for index, pose in enumerate(path):
         error_m = noise.normal(0.0, 0.01, BEAMS) if noise is not None else 0.0
-        motion = certain(pose) if index == 0 else gaussian(inverse(path[index - 1]) @ pose)
+        motion = certain(pose)
+        if index > 0:
+            motion = gaussian(inverse(path[index - 1]) @ pose, sigma_rad=0.001, sigma_m=0.005)
         result.append(
             Keyframe(
                 index=first + index,
