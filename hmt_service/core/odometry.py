@@ -126,25 +126,14 @@ class Odometry:
         expected = GaussianPose(
             exp(sweep_share * log(motion.mean)), sweep_share * motion.covariance
         )
-        posed, fit, failure = self._register(
-            sweep, self._keyframe_from_body @ motion, expected, elapsed_s=elapsed_s
-        )
+        predicted = self._keyframe_from_body @ motion
+        posed, fit, failure = self._register(sweep, predicted, expected, elapsed_s=elapsed_s)
         sweep_motion = log(expected.mean) if fit is None else fit.motion
-        error = self._error_of(sweep, sweep_motion, log(expected.mean))
-        if fit is not None and failure is None:
-            # Half, because the keyframe has as much: most of a step's error is that of its ends.
-            noise = 0.5 * (1.0 - self._covariance.drift_share) * fit.scan_share
-            error, drift = error + noise, posed.covariance - 2.0 * noise
-            if len(self._window) == 1:
-                drift = drift + noise  # the first keyframe had nothing to be registered in
-        else:
-            drift = posed.covariance
-        registration = None if fit is None else self._registration(fit, motion)
+        uneven = self._error_of(sweep, sweep_motion, log(expected.mean))
+        registration = None if fit is None else _registration(fit, predicted.mean)
         self._remember_motion(posed.mean, elapsed_s, sweep_motion)
         self._failures = 0 if failure is None else self._failures + 1
-        # What is said of the pose holds what is wrong with the keyframe and with this scan.
-        told = GaussianPose(identity(), self._keyframe_error) @ GaussianPose(posed.mean, drift)
-        told = self._confined(GaussianPose(told.mean, told.covariance + error))
+        told, error = self._told(posed, fit if failure is None else None, uneven)
         if self._is_keyframe(posed.mean, len(sweep.points), registration, failure):
             if failure is not None and not self._has_new_odometry:
                 told = self._lost(told.mean, scan.stamp_s - self._registered_s)
@@ -257,15 +246,28 @@ class Odometry:
             return TrackingFailure.CORRECTION_TOO_LARGE
         return None
 
-    def _registration(self, fit: Fit, motion: GaussianPose) -> Registration:
-        correction = inverse(self._keyframe_from_body.mean @ motion.mean) @ fit.pose
-        return Registration(
-            inlier_share=fit.inlier_share,
-            known_share=fit.known_share,
-            prior_weight=fit.prior_weight,
-            correction_m=float(np.linalg.norm(correction[:3, 3])),
-            degenerate=fit.degenerate,
-        )
+    def _told(
+        self, posed: GaussianPose, fit: Fit | None, uneven: FloatArray
+    ) -> tuple[GaussianPose, FloatArray]:
+        """Return the pose with all that is wrong with it, and what is wrong with this scan alone.
+
+        What is wrong with the keyframe alone is part of the first, as `Keyframe.own_error` says.
+
+        Args:
+            posed: The pose in the last keyframe as it was registered, or predicted.
+            fit: The registration; None if there is none.
+            uneven: Covariance of the scan's pose because of the motion during its sweep.
+        """
+        noise = np.zeros((6, 6))
+        if fit is not None:
+            # Half, because the keyframe has as much: most of a step's error is that of its ends.
+            noise = 0.5 * (1.0 - self._covariance.drift_share) * fit.scan_share
+        # The first keyframe of a window had nothing to be registered in: its noise is here.
+        ends = 1.0 if len(self._window) == 1 else 2.0
+        drift = GaussianPose(posed.mean, posed.covariance - ends * noise)
+        told = GaussianPose(identity(), self._keyframe_error) @ drift
+        error = uneven + noise
+        return self._confined(GaussianPose(told.mean, told.covariance + error)), error
 
     def _error_of(self, sweep: Sweep, motion: FloatArray, predicted: FloatArray) -> FloatArray:
         """Return the covariance of a pose because the motion during its sweep was not uniform.
@@ -385,3 +387,14 @@ class Odometry:
         if failure is None:
             self._registered_s = scan.stamp_s
         self._odometry_at_scan = self._odometry
+
+
+def _registration(fit: Fit, predicted: Pose) -> Registration:
+    correction = inverse(predicted) @ fit.pose
+    return Registration(
+        inlier_share=fit.inlier_share,
+        known_share=fit.known_share,
+        prior_weight=fit.prior_weight,
+        correction_m=float(np.linalg.norm(correction[:3, 3])),
+        degenerate=fit.degenerate,
+    )
