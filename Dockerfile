@@ -9,12 +9,13 @@ RUN apt-get update \
 WORKDIR /opt/hmt
 COPY pyproject.toml constraints.txt README.md LICENSE ./
 COPY hmt_service ./hmt_service
-RUN pip install --no-cache-dir -c constraints.txt . \
-    && cd / && python -c 'from hmt_service.core import local_map; local_map.compile_all_kernels()'
+RUN pip install --no-cache-dir -c constraints.txt .
 
 RUN useradd --create-home --uid 1000 hmt \
     && install --directory --owner hmt --group hmt /data
 USER hmt
+# As the user who runs it: compiled code is looked for where that user may write.
+RUN cd / && python -c 'from hmt_service.core import local_map; local_map.compile_all_kernels()'
 # Maps and recordings: mount a volume here.
 WORKDIR /data
 VOLUME /data

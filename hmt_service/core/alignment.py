@@ -1,8 +1,8 @@
 """Alignment of two submaps: all relative poses that their contents allow inside a prior.
 
 References:
-    Design section 2.4, step 2 (correlation of bird's-eye views over rotations, then registration).
-    Censi, An accurate closed-form estimate of ICP's covariance, ICRA 2007.
+    Blanco et al. 2008, section IV-A (the transition model looks at every place that may match).
+    Olson, Real-time correlative scan matching, ICRA 2009 (a search over all rotations comes first).
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from hmt_service.core.geometry import (
     Pose,
     adjoint,
     certain,
+    confined,
     identity,
     inverse,
     isotropic_covariance,
     log,
-    planar_covariance,
     planar_pose,
     skew,
     transform_points,
@@ -37,8 +37,6 @@ _SINGLE_BASIN_M = 0.25
 _SINGLE_BASIN_RAD = 0.05
 # How far a guess may be off; the prior of its registration, next to nothing.
 _BASIN_M, _BASIN_RAD = 1.0, 0.3
-# Standard deviation along a direction that the match says nothing about, m and rad.
-_UNSEEN = 10.0
 _SEPARATION_M = 0.6
 _SEPARATION_RAD = 0.15
 _SEPARATION_SIGMA = 4.0
@@ -101,13 +99,13 @@ class Aligner:
             min_overlap: Least share of the visit's points that the target must explain.
         """
         near = isotropic_covariance(sigma_rad=_BASIN_RAD, sigma_m=_BASIN_M)
-        prior = GaussianPose(guess, planar_covariance(near) if self._is_planar else near)
+        prior = GaussianPose(guess, confined(near, is_planar=self._is_planar))
         fit = target.local_map.fit(visit.sweep, prior, certain(identity()), guess)
         if not fit.is_converged or fit.inlier_share < min_overlap:
             return None
         moved = adjoint(inverse(fit.pose))
         covariance = (
-            fit.own_covariance(_UNSEEN)
+            fit.own_covariance
             + visit.bend
             + moved @ target.bend @ moved.T
             + isotropic_covariance(
@@ -115,9 +113,8 @@ class Aligner:
                 sigma_m=self._covariance.floor_submap_m,
             )
         )
-        if self._is_planar:
-            covariance = planar_covariance(covariance)
-        return Mode(GaussianPose(fit.pose, covariance), fit.inlier_share)
+        confined_covariance = confined(covariance, is_planar=self._is_planar)
+        return Mode(GaussianPose(fit.pose, confined_covariance), fit.inlier_share)
 
     def _guesses(self, visit: Visit, target: Visit, prior: GaussianPose) -> list[Pose]:
         sigmas = np.sqrt(np.diag(prior.covariance))

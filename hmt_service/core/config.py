@@ -109,7 +109,8 @@ class CovarianceConfig(Section):
     """Standard deviation of the pose of a sweep because its motion is not uniform: as a share of
     its turn, and of the change of speed since the sweep before. Fitted in simulated worlds."""
     sigma_submap_m: float = Field(default=0.04, gt=0.0)
-    """Standard deviation of one residual between two submaps: they are bent as well as noisy."""
+    """Standard deviation of one residual between two submaps, which share surfaces only roughly;
+    how far they are bent is known of each visit and comes on top."""
     floor_submap_m: float = Field(default=0.005, gt=0.0)
     """Least standard deviation of the translation between two submaps."""
     floor_submap_rad: float = Field(default=0.001, gt=0.0)

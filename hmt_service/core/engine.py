@@ -19,7 +19,7 @@ from hmt_service.core.alignment import Aligner
 from hmt_service.core.area_abstraction import overlap_of, partition
 from hmt_service.core.composition import arcs_of, compose_shortest_paths, residual_m
 from hmt_service.core.config import Config
-from hmt_service.core.geometry import GaussianPose, Pose, inverse, log
+from hmt_service.core.geometry import FloatArray, GaussianPose, Pose, inverse, log
 from hmt_service.core.graph import Factor, PoseGraph
 from hmt_service.core.hypotheses import Assignment, Hypothesis, ParticleLayer
 from hmt_service.core.observation import ObservationModel
@@ -89,7 +89,7 @@ class Engine:
         self._next_hypothesis = 0
         self._revision = 0
         self._finished_revision = 0
-        self._smoothed_revision = 0
+        self._smoothed: tuple[int, FloatArray] | None = None
 
     # ------------------------------------------------------------------ from scans to hypotheses
 
@@ -167,10 +167,16 @@ class Engine:
             self._refine(self._open)
             self._revision += 1
             self._finished_revision = self._revision
-        if self._visits and not is_urgent and self._smoothed_revision < self._revision:
-            self._smoothed = self._smoother.smooth(self._particles.best, self._visits)
-            self._smoothed_revision = self._revision
+        if self._visits and not is_urgent and self._smooth_poses() is None:
+            poses = self._smoother.smooth(self._particles.best, self._visits)
+            self._smoothed = self._revision, poses
         return ()
+
+    def _smooth_poses(self) -> FloatArray | None:
+        """Return the smoothed poses of all keyframes, unless the map has changed since."""
+        if self._smoothed is None or self._smoothed[0] != self._revision:
+            return None
+        return self._smoothed[1]
 
     @property
     def _open(self) -> Visit:
@@ -427,8 +433,9 @@ class Engine:
         """
         if not self._visits:
             return ()
-        is_smooth = self._smoothed_revision == self._revision
-        poses = self._smoothed if is_smooth else self._particles.best.keyframe_poses(self._visits)
+        poses = self._smooth_poses()
+        if poses is None:
+            poses = self._particles.best.keyframe_poses(self._visits)
         return tuple(
             StampedPose(scan.stamp_s, poses[scan.keyframe_index] @ scan.keyframe_from_body)
             for scan in self._scans

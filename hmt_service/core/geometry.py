@@ -187,6 +187,11 @@ def planar_covariance(covariance: FloatArray, *, off_plane_sigma: float = 1e-4) 
     return result
 
 
+def confined(covariance: FloatArray, *, is_planar: bool) -> FloatArray:
+    """Return a covariance as one of a robot: in the plane if it is planar, shape (6, 6)."""
+    return planar_covariance(covariance) if is_planar else symmetric(covariance)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class GaussianPose:
     """A Gaussian over the transform `a_from_b`: `mean @ exp(xi)`, xi ~ N(0, covariance)."""

@@ -35,7 +35,7 @@ _REFERENCE_SIGMA = 1e-2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Factor:
-    """A Gaussian arc between two visits."""
+    """A Gaussian arc between two visits, or two keyframes where these are the nodes."""
 
     visit_a: int
     """One end."""
@@ -94,7 +94,7 @@ def _from_pose2(pose: gtsam.Pose2) -> Pose:
 
 
 class PoseGraph:
-    """Poses of visits tied by Gaussian arcs; cheap to copy, solved on demand."""
+    """Poses of visits (of keyframes, in smoothing) tied by Gaussian arcs; solved on demand."""
 
     def __init__(self, *, is_planar: bool) -> None:
         """Start empty.

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import chi2
 
+from hmt_service.core.config import Config
 from hmt_service.core.geometry import (
     PLANAR_AXES,
     FloatArray,
@@ -53,6 +54,8 @@ _FOUND_SHARE, _CONTRADICTED, _BETTER = 0.5, 0.9, 1.5
 # Normals are good to so many rad: a direction that is opposed by less than the square of it, as a
 # share of what opposes the best-known one, may be opposed by nothing else.
 _TILT = 0.1
+# Standard deviation of a direction that a scan says nothing about, m and rad.
+_UNSEEN = 10.0
 # Largest squared distance of a prior that is believed: 95 % of all that are honest are nearer.
 _GATE = {axes: float(chi2.ppf(0.95, axes)) for axes in (3, 6)}
 
@@ -124,13 +127,10 @@ class Fit:
     is_converged: bool
     """Whether the iteration came to rest."""
 
-    def own_covariance(self, unseen: float) -> FloatArray:
-        """Return the covariance of the pose by the scan alone, shape (6, 6).
-
-        Args:
-            unseen: Standard deviation where it says nothing, m and rad.
-        """
-        together: FloatArray = self.information + np.eye(6) / unseen**2
+    @property
+    def own_covariance(self) -> FloatArray:
+        """Covariance of the pose by the scan alone, shape (6, 6), wide where it says nothing."""
+        together: FloatArray = self.information + np.eye(6) / _UNSEEN**2
         return symmetric(np.linalg.inv(together).astype(np.float64))
 
 
@@ -150,6 +150,15 @@ class SeenPoints:
         """Return points as a sensor sees them."""
         cells_m = (cell_m, _COARSE * cell_m)
         return cls(points, directions_of(points, sensor_in_body, cells_m, is_planar=is_planar))
+
+    @classmethod
+    def of_keyframe(
+        cls, points: FloatArray, sensor_in_body: FloatArray, config: Config
+    ) -> SeenPoints:
+        """Return what a keyframe adds to a local map: of a LiDAR's points, one per cell."""
+        cell_m, is_planar = config.odometry.voxel_size_m, config.sensor.is_planar
+        kept = points if is_planar else points[thin(points, cell_m)]
+        return cls.of(kept, sensor_in_body, cell_m=cell_m, is_planar=is_planar)
 
     @classmethod
     def together(cls, poses: Sequence[Pose], parts: Sequence[SeenPoints]) -> SeenPoints:
@@ -195,6 +204,17 @@ class LocalMap:
             for times, spread in ((1, 1.0), (_COARSE, _COARSE_SIGMA))
         )
 
+    @classmethod
+    def of(cls, seen: SeenPoints, config: Config, *, sigma_m: float) -> LocalMap:
+        """Return a map of some points, with cells as configured."""
+        return cls(
+            seen,
+            cell_m=config.odometry.voxel_size_m,
+            sigma_m=sigma_m,
+            degenerate_m=config.covariance.degenerate_m,
+            is_planar=config.sensor.is_planar,
+        )
+
     def register(self, sweep: Sweep, prior: GaussianPose, motion: GaussianPose) -> Fit:
         """Return where the scan fits, fused with what was expected.
 
@@ -211,7 +231,8 @@ class LocalMap:
         turns = np.zeros((len(_SEARCH_RAD), 6))
         turns[:, 2] = _SEARCH_RAD
         others = [self.fit(sweep, prior, motion, prior.mean @ turn) for turn in exp(turns)]
-        best = max(others, key=lambda other: other.inlier_share)
+        at_rest = [other for other in others if other.is_converged]
+        best = max(at_rest, key=lambda other: other.inlier_share, default=fit)
         least = max(_FOUND_SHARE, _BETTER * fit.inlier_share)
         return best if best.inlier_share >= least else fit
 

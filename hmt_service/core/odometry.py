@@ -17,14 +17,13 @@ from hmt_service.core.geometry import (
     GaussianPose,
     Pose,
     certain,
+    confined,
     exp,
     identity,
     inverse,
     isotropic_covariance,
     log,
-    planar_covariance,
     project_planar,
-    symmetric,
 )
 from hmt_service.core.local_map import Fit, LocalMap, SeenPoints, Sweep, compile_kernels
 from hmt_service.core.surfels import thin
@@ -67,7 +66,7 @@ class Odometry:
             config: Settings of all stages.
         """
         self._sensor = config.sensor
-        self._config = config.odometry
+        self._config = config
         self._motion = config.motion
         self._covariance = config.covariance
         self._window: deque[tuple[Pose, SeenPoints]] = deque(
@@ -148,7 +147,7 @@ class Odometry:
     def _begin(self, scan: Scan) -> Tracking:
         sweep, _ = self._sweep_of(scan, np.inf)
         here = certain(identity())
-        if len(sweep.points) < self._config.min_points:
+        if len(sweep.points) < self._config.odometry.min_points:
             return Tracking(scan.stamp_s, 0, here, None, TrackingFailure.TOO_FEW_POINTS)
         return self._add_keyframe(scan, sweep.points, here, np.zeros((6, 6)), None, None)
 
@@ -183,7 +182,9 @@ class Odometry:
             sigma_m = noise.sigma_floor_m + noise.acceleration_m_s2 * elapsed_s**2
         else:
             motion = identity()
-            sigma_rad, sigma_m = _LOST_RAD, noise.max_speed_m_s * elapsed_s
+            # Two scans of one moment are no reason to know where the second was taken.
+            sigma_rad = _LOST_RAD
+            sigma_m = noise.sigma_floor_m + noise.max_speed_m_s * elapsed_s
         if self._sensor.is_planar:
             motion = project_planar(motion)
         covariance = isotropic_covariance(sigma_rad=sigma_rad, sigma_m=sigma_m)
@@ -205,7 +206,7 @@ class Odometry:
             share = min(float(np.median(self._intervals_s)) / elapsed_s, 1.0)
         lags = np.zeros(len(points)) if times is None or not is_timed else 1.0 - times
         if not self._sensor.is_planar and len(points):
-            kept = thin(points, _KEPT_CELLS * self._config.voxel_size_m)
+            kept = thin(points, _KEPT_CELLS * self._config.odometry.voxel_size_m)
             points, lags = points[kept], lags[kept]
         return Sweep(points, lags, scan.sensor_in_body - points), share
 
@@ -215,7 +216,7 @@ class Odometry:
         self, sweep: Sweep, predicted: GaussianPose, motion: GaussianPose, *, elapsed_s: float
     ) -> tuple[GaussianPose, Fit | None, TrackingFailure | None]:
         """Return the pose in the last keyframe after the scan has been seen, and how it fits."""
-        config = self._config
+        config = self._config.odometry
         is_bridged = self._odometry_at_scan is not None and self._has_new_odometry
         if elapsed_s > config.max_gap_s and not is_bridged:
             return predicted, None, TrackingFailure.GAP_IN_TIME
@@ -233,7 +234,7 @@ class Odometry:
         return self._confined(GaussianPose(fit.pose, fit.covariance + floor)), fit, None
 
     def _failure_of(self, fit: Fit, predicted: GaussianPose) -> TrackingFailure | None:
-        config = self._config
+        config = self._config.odometry
         if not fit.is_converged:
             return TrackingFailure.NOT_CONVERGED
         if fit.inlier_share < config.min_inlier_share:
@@ -285,9 +286,8 @@ class Odometry:
 
     def _confined(self, pose: GaussianPose) -> GaussianPose:
         """Return the pose as uncertain as the robot can be: in the plane if it is planar."""
-        if not self._sensor.is_planar:
-            return GaussianPose(pose.mean, symmetric(pose.covariance))
-        return GaussianPose(pose.mean, planar_covariance(pose.covariance))
+        is_planar = self._sensor.is_planar
+        return GaussianPose(pose.mean, confined(pose.covariance, is_planar=is_planar))
 
     def _lost(self, mean: Pose, elapsed_s: float) -> GaussianPose:
         """Return a pose that is bounded by the robot's speed only."""
@@ -305,7 +305,7 @@ class Odometry:
         failure: TrackingFailure | None,
     ) -> bool:
         """Return whether the scan is kept: after motion, of new space, or to start anew."""
-        config = self._config
+        config = self._config.odometry
         if points < config.min_points:
             return False
         if failure is not None:
@@ -340,15 +340,7 @@ class Odometry:
             own_error=error,
             failure=failure,
         )
-        # The local map has many keyframes: of each it needs one point per cell.
-        is_planar = self._sensor.is_planar
-        mapped = points if is_planar else points[thin(points, self._config.voxel_size_m)]
-        seen = SeenPoints.of(
-            mapped,
-            scan.sensor_in_body,
-            cell_m=self._config.voxel_size_m,
-            is_planar=is_planar,
-        )
+        seen = SeenPoints.of_keyframe(points, scan.sensor_in_body, self._config)
         self._move_window(previous_from_body.mean, seen, is_lost=failure is not None)
         self._keyframes += 1
         self._keyframe_from_body = certain(identity())
@@ -364,22 +356,20 @@ class Odometry:
         kept = [] if is_lost else [(body_from_previous @ pose, each) for pose, each in self._window]
         self._window.clear()
         self._window.extend([*kept, (identity(), seen)])
-        self._map = LocalMap(
+        self._map = LocalMap.of(
             SeenPoints.together(*zip(*self._window, strict=True)),
-            cell_m=self._config.voxel_size_m,
+            self._config,
             sigma_m=self._covariance.sigma_m,
-            degenerate_m=self._covariance.degenerate_m,
-            is_planar=self._sensor.is_planar,
         )
 
     def _remember_motion(self, posed: Pose, elapsed_s: float, sweep_motion: FloatArray) -> None:
-        self._last_motion = inverse(self._keyframe_from_body.mean) @ posed
+        motion = inverse(self._keyframe_from_body.mean) @ posed
+        if elapsed_s > 0.0:
+            # Two scans of one moment say nothing of the speed.
+            self._last_motion, self._last_elapsed_s = motion, elapsed_s
         self._last_sweep_motion = sweep_motion
-        self._last_elapsed_s = elapsed_s
         self._motion_since_odometry = (
-            identity()
-            if self._has_new_odometry
-            else self._motion_since_odometry @ self._last_motion
+            identity() if self._has_new_odometry else self._motion_since_odometry @ motion
         )
 
     def _remember(self, scan: Scan, failure: TrackingFailure | None) -> None:

@@ -23,18 +23,17 @@ from hmt_service.core.geometry import (
     GaussianPose,
     Pose,
     certain,
+    confined,
     identity,
     inverse,
     isotropic_covariance,
     log,
-    planar_covariance,
     transform_points,
 )
 from hmt_service.core.graph import Factor, PoseGraph
 from hmt_service.core.hypotheses import Hypothesis
 from hmt_service.core.local_map import LocalMap, SeenPoints, Sweep
 from hmt_service.core.submap import Visit
-from hmt_service.core.surfels import thin
 from hmt_service.core.types import Keyframe
 
 # Keyframes look at the same when the middles of what they see are so near.
@@ -49,10 +48,8 @@ _MOST_M, _MOST_RAD = 0.5, 0.15
 _LEAST_SHARE = 0.5
 # Windows are bent by so much.
 _FLOOR_M, _FLOOR_RAD = 0.005, 0.002
-# Squared distance in standard deviations from all the others together beyond which a tie is left.
+# Ties so far from where all together put their ends, in squared standard deviations, are left out.
 _GATE = 100.0
-# Standard deviation of a direction that a tie says nothing about.
-_UNSEEN = 10.0
 
 
 class Smoother:
@@ -64,9 +61,10 @@ class Smoother:
         Args:
             config: Settings of all stages.
         """
+        self._config = config
         self._is_planar = config.sensor.is_planar
-        self._odometry = config.odometry
-        self._covariance = config.covariance
+        # Keyframes that share a local map, or a window, have nothing new to say of each other.
+        self._gap = max(config.odometry.window_keyframes, _WINDOW + _STRIDE)
 
     def smooth(self, hypothesis: Hypothesis, visits: Mapping[int, Visit]) -> FloatArray:
         """Return `reference_from_keyframe` of every keyframe, shape (K, 4, 4).
@@ -80,18 +78,15 @@ class Smoother:
         ties = self._ties(keyframes, poses)
         if not ties:
             return poses
-        motions = [
-            Factor(before, before + 1, keyframe.previous_from_body)
-            for before, (_, keyframe) in enumerate(pairwise(keyframes))
-        ]
-        solved = self._solved(poses, motions, ties)
+        known = [*_motions(keyframes), *_alignments(hypothesis, visits)]
+        solved = self._solved(poses, known, ties)
         agreed = [tie for tie in ties if _distance2(tie, solved) <= _GATE]
-        return solved if len(agreed) == len(ties) else self._solved(solved, motions, agreed)
+        return solved if len(agreed) == len(ties) else self._solved(solved, known, agreed)
 
     def _solved(
-        self, poses: FloatArray, motions: Sequence[Factor], ties: Sequence[Factor]
+        self, poses: FloatArray, known: Sequence[Factor], ties: Sequence[Factor]
     ) -> FloatArray:
-        graph = PoseGraph.of(poses, [*motions, *ties], is_planar=self._is_planar)
+        graph = PoseGraph.of(poses, [*known, *ties], is_planar=self._is_planar)
         return np.array([graph.pose(index) for index in range(len(poses))])
 
     def _ties(self, keyframes: Sequence[Keyframe], poses: FloatArray) -> list[Factor]:
@@ -120,11 +115,10 @@ class Smoother:
 
     def _other_times(self, index: int, near: Sequence[int], views: FloatArray) -> list[int]:
         """Return the keyframe with the nearest view of each earlier time, the nearest first."""
-        gap = self._odometry.window_keyframes
-        earlier = np.sort([other for other in near if other < index - gap])
+        earlier = np.sort([other for other in near if other < index - self._gap])
         if not len(earlier):
             return []
-        times = np.split(earlier, np.flatnonzero(np.diff(earlier) > gap) + 1)
+        times = np.split(earlier, np.flatnonzero(np.diff(earlier) > self._gap) + 1)
         nearest = []
         for time in times:
             distances = np.linalg.norm(views[time] - views[index], axis=1)
@@ -133,44 +127,66 @@ class Smoother:
         return [other for _, other in sorted(nearest)[:_MOST_TIMES]]
 
     def _tie(self, window: LocalMap, sweep: Sweep, expected: Pose) -> GaussianPose | None:
-        near = self._confined(isotropic_covariance(sigma_rad=_SIGMA_RAD, sigma_m=_SIGMA_M))
+        wide = isotropic_covariance(sigma_rad=_SIGMA_RAD, sigma_m=_SIGMA_M)
+        near = confined(wide, is_planar=self._is_planar)
         fit = window.fit(sweep, GaussianPose(expected, near), certain(identity()), expected)
         moved = log(inverse(expected) @ fit.pose)
         is_near = np.linalg.norm(moved[3:]) <= _MOST_M and np.linalg.norm(moved[:3]) <= _MOST_RAD
         if not (fit.is_converged and is_near and fit.inlier_share >= _LEAST_SHARE):
             return None
         floor = isotropic_covariance(sigma_rad=_FLOOR_RAD, sigma_m=_FLOOR_M)
-        return GaussianPose(fit.pose, self._confined(fit.own_covariance(_UNSEEN) + floor))
-
-    def _confined(self, covariance: FloatArray) -> FloatArray:
-        return planar_covariance(covariance) if self._is_planar else covariance
+        return GaussianPose(
+            fit.pose, confined(fit.own_covariance + floor, is_planar=self._is_planar)
+        )
 
     def _seen(self, keyframe: Keyframe) -> SeenPoints:
-        cell_m = self._odometry.voxel_size_m
         points = np.ascontiguousarray(keyframe.points_in_body, dtype=np.float64)
-        if not self._is_planar:
-            points = points[thin(points, cell_m)]
-        return SeenPoints.of(
-            points, keyframe.sensor_in_body, cell_m=cell_m, is_planar=self._is_planar
-        )
+        return SeenPoints.of_keyframe(points, keyframe.sensor_in_body, self._config)
 
     def _sweep(self, seen: SeenPoints, keyframe: Keyframe) -> Sweep:
         points = seen.points
         sweep = Sweep(points, np.zeros(len(points)), keyframe.sensor_in_body - points)
         if self._is_planar:
             return sweep
-        return sweep.thinned(self._odometry.voxel_size_m, self._odometry.max_points)
+        odometry = self._config.odometry
+        return sweep.thinned(odometry.voxel_size_m, odometry.max_points)
 
     def _window(self, middle: int, seen: Sequence[SeenPoints], poses: FloatArray) -> LocalMap:
         indices = range(max(0, middle - _WINDOW), min(len(poses), middle + _WINDOW + 1))
         relative = [inverse(poses[middle]) @ poses[index] for index in indices]
-        return LocalMap(
+        return LocalMap.of(
             SeenPoints.together(relative, [seen[index] for index in indices]),
-            cell_m=self._odometry.voxel_size_m,
-            sigma_m=self._covariance.sigma_m,
-            degenerate_m=self._covariance.degenerate_m,
-            is_planar=self._is_planar,
+            self._config,
+            sigma_m=self._config.covariance.sigma_m,
         )
+
+
+def _motions(keyframes: Sequence[Keyframe]) -> list[Factor]:
+    """Return the motions between neighbours.
+
+    What is wrong with a keyframe alone is in the motions to and from it; here both have it, as if
+    apart: the trajectory then bends a little more freely to the ties, which hold it better.
+    """
+    return [
+        Factor(before, before + 1, keyframe.previous_from_body)
+        for before, (_, keyframe) in enumerate(pairwise(keyframes))
+    ]
+
+
+def _alignments(hypothesis: Hypothesis, visits: Mapping[int, Visit]) -> list[Factor]:
+    """Return what ties visits to others than their neighbours, between their first keyframes.
+
+    Where the odometry was lost between two visits, nothing else says where the second is.
+    """
+    return [
+        Factor(
+            visits[factor.visit_a].first_keyframe,
+            visits[factor.visit_b].first_keyframe,
+            factor.a_from_b,
+        )
+        for factor in hypothesis.graph.factors
+        if factor.visit_b != factor.visit_a + 1
+    ]
 
 
 def _distance2(tie: Factor, poses: FloatArray) -> float:

@@ -68,7 +68,10 @@ class Visit:
 
     @cached_property
     def points(self) -> FloatArray:
-        """Submap: what stood still, in the visit's frame, one point per voxel, shape (N, 3), m."""
+        """Submap: what stood still, in the visit's frame, shape (N, 3), m.
+
+        One point per cell of half a voxel.
+        """
         return self.seen.points
 
     @cached_property
@@ -116,13 +119,7 @@ class Visit:
     @cached_property
     def local_map(self) -> LocalMap:
         """The submap, ready to register others in it."""
-        return LocalMap(
-            self.seen,
-            cell_m=self.config.odometry.voxel_size_m,
-            sigma_m=self.config.covariance.sigma_submap_m,
-            degenerate_m=self.config.covariance.degenerate_m,
-            is_planar=self.config.sensor.is_planar,
-        )
+        return LocalMap.of(self.seen, self.config, sigma_m=self.config.covariance.sigma_submap_m)
 
     @cached_property
     def bend(self) -> FloatArray:

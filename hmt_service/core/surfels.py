@@ -140,9 +140,9 @@ def _cells_of(
 
 
 @njit(cache=True)
-def _first_points(points: FloatArray, cell_m: float, is_planar: bool) -> Indices:
+def _first_points(points: FloatArray, cell_m: float) -> Indices:
     """Return the index of the first point in each cell, in the order of the points."""
-    _, keys, _, cell_of = _cells_of(points, cell_m, is_planar)
+    _, keys, _, cell_of = _cells_of(points, cell_m, False)
     first = np.empty(len(keys), np.int64)
     seen = 0
     for n in range(len(points)):
@@ -929,7 +929,7 @@ def directions_of(
     return np.asarray(directions)
 
 
-def thin(points: FloatArray, cell_m: float, *, is_planar: bool = False) -> Indices:
+def thin(points: FloatArray, cell_m: float) -> Indices:
     """Return the indices of the first point in each occupied cell, in their order."""
-    indices: Indices = _first_points(points, cell_m, is_planar)
+    indices: Indices = _first_points(points, cell_m)
     return indices

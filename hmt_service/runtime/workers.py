@@ -18,6 +18,7 @@ from multiprocessing.connection import Connection, wait
 from typing import Any, TypeVar
 
 from hmt_service.core.config import Config
+from hmt_service.core.types import Event
 from hmt_service.errors import DaemonFailure, HmtError, Unavailable
 from hmt_service.runtime.messages import (
     CompareRequest,
@@ -102,16 +103,22 @@ class _Topology:
 
     def finish(self, finish: Finish) -> Mapped:
         """Complete the map and save it."""
+        events, finished = self._finished(finish.number, is_urgent=True)
+        if not finish.is_urgent:
+            # Smoothing takes a while: what there is has been saved, should the daemon be stopped.
+            more, finished = self._finished(finish.number, is_urgent=False)
+            events = (*events, *more)
+        return Mapped(self._engine.snapshot(), events, self._report(), finished)
+
+    def _finished(self, number: int, *, is_urgent: bool) -> tuple[tuple[Event, ...], Finished]:
         started = time.perf_counter()
-        events = self._engine.finish(is_urgent=finish.is_urgent)
+        events = self._engine.finish(is_urgent=is_urgent)
         self._busy_s += time.perf_counter() - started
         save = self._save
         saved = () if save is None else _guarded(lambda: save(self._engine, self._report()))
         if isinstance(saved, HmtError):
-            finished = Finished(finish.number, (), str(saved))
-        else:
-            finished = Finished(finish.number, saved)
-        return Mapped(self._engine.snapshot(), events, self._report(), finished)
+            return events, Finished(number, (), str(saved))
+        return events, Finished(number, saved)
 
     def answer(self, request: Request) -> Result:
         """Return what was asked for, or why there is none."""

@@ -64,9 +64,10 @@ def test_poses_of_a_right_map_are_about_as_wrong_as_they_say() -> None:
     belief = closed_ring()
     assert belief.is_planar
     assert len(belief.odometry_errors) > 100
-    assert 0.02 < consistency(belief.odometry_errors, is_planar=True).mean < 50.0
+    # The readings are without noise: less wrong than they may be, and never more.
+    assert 0.1 < consistency(belief.odometry_errors, is_planar=True).mean < 1.2
     for errors in (belief.arc_errors, belief.area_errors):
-        assert 0.002 < consistency(errors, is_planar=True).mean < 50.0
+        assert 0.005 < consistency(errors, is_planar=True).mean < 1.2
 
 
 def test_the_same_loops_are_false_if_the_truth_is_on_another_floor() -> None:

@@ -144,7 +144,7 @@ def test_position_along_a_corridor_without_wheels_is_less_certain() -> None:
     assert np.sqrt(known[3, 3]) == pytest.approx(np.sqrt(10.0) * 0.02, rel=0.01)
     # Steps of 0.1 s: at first nobody knows the speed, then nobody says whether it has changed.
     motion = load_config().motion
-    first_m, next_m = motion.max_speed_m_s * 0.1, 0.02 + motion.acceleration_m_s2 * 0.1**2
+    first_m, next_m = 0.02 + motion.max_speed_m_s * 0.1, 0.02 + motion.acceleration_m_s2 * 0.1**2
     assert guessed[3, 3] == pytest.approx(first_m**2 + 9.0 * next_m**2, rel=0.02)
 
 
@@ -350,6 +350,14 @@ def test_wheels_that_contradict_the_scan_are_trusted_less_where_it_is_blind() ->
     assert tracking.registration.prior_weight == pytest.approx(7.81 / 36.0, rel=0.02)
     sigma_m = np.sqrt(tracking.keyframe_from_body.covariance[3, 3])
     assert sigma_m == pytest.approx(0.02 * np.sqrt(36.0 / 7.81), rel=0.1)
+
+
+def test_two_scans_of_one_moment_say_nothing_of_the_speed() -> None:
+    readings = drive(ROOM, CURVE[:30])
+    doubled = [again for reading in readings for again in (reading, reading)]
+    trackings, alone = track(doubled), track(readings)
+    assert not [tracking.failure for tracking in trackings if tracking.failure is not None]
+    assert poses_of(trackings)[-1] == pytest.approx(poses_of(alone)[-1], abs=0.01)
 
 
 def test_readings_of_wheels_alone_give_nothing() -> None:

@@ -12,10 +12,8 @@ from hmt_service.core.config import load_config
 from hmt_service.core.geometry import (
     GaussianPose,
     Pose,
-    exp,
     identity,
     inverse,
-    planar_covariance,
     planar_pose,
 )
 from hmt_service.core.graph import Factor, PoseGraph
@@ -98,26 +96,17 @@ def test_planar_poses_stay_planar_and_the_same_bytes_come_twice(seed: int) -> No
     assert not first[:, 2, [0, 1, 3]].any()
 
 
-def test_own_errors_cancel_along_the_path() -> None:
-    own = planar_covariance(motion_covariance(0.002, 0.01))
-    drift = planar_covariance(motion_covariance(0.0005, 0.001))
-    keyframes = [
-        replace(
-            keyframe,
-            own_error=own,
-            previous_from_body=GaussianPose(identity(), drift + 2.0 * own),
-        )
-        for keyframe in keyframes_along(ROOM, [identity()] * 21)
-    ]
-    visit = visit_of(0, keyframes, CONFIG)
-    ends = 2.0 * own[3, 3]
-    for count in (1, 5, 20):
-        variance = visit.visit_from_keyframe[count].covariance[3, 3]
-        assert variance == pytest.approx(ends + count * drift[3, 3], rel=1e-6)
-    # Cut in two and joined again, it is the same.
-    earlier, later, motion = visit.split(10)
-    assert motion.covariance[3, 3] == pytest.approx(ends + 10 * drift[3, 3], rel=1e-6)
-    assert later.visit_from_keyframe[-1].covariance[3, 3] == pytest.approx(
-        ends + 10 * drift[3, 3], rel=1e-6
-    )
-    assert np.allclose(exp(np.zeros(6)), earlier.visit_from_keyframe[0].mean)
+def test_a_visit_that_is_tied_by_its_alignment_alone_stays_where_that_says() -> None:
+    there, back = bent(PATH, turn_rad=0.008)
+    # Lost on the way to a room out of sight of the first: the motion says nothing, and is wrong.
+    elsewhere = keyframes_along(ROOM, OUT[:4], first=len(PATH))
+    lost = GaussianPose(planar_pose(3.0, 2.0, 0.5), motion_covariance(1.8, 25.0))
+    far = visit_of(2, [replace(elsewhere[0], previous_from_body=lost), *elsewhere[1:]], CONFIG)
+    place = GaussianPose(planar_pose(20.0, -5.0, 0.3), motion_covariance(0.01, 0.03))
+    hypothesis = hypothesis_of([there, back])
+    arc = Factor(1, 2, back.visit_from_keyframe[-1] @ lost)
+    tied = hypothesis.extended(Assignment(2, 0, place), arc, hypothesis=1, log_weight=0.0)
+    known = {0: there, 1: back, 2: far}
+    after = Smoother(CONFIG).smooth(tied, known)
+    assert not np.array_equal(after, tied.keyframe_poses(known))
+    assert after[len(PATH)] == pytest.approx(place.mean, abs=0.01)

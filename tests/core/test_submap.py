@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -10,9 +12,16 @@ from scipy.spatial import KDTree
 
 from hmt_service.core.area_abstraction import cells_of
 from hmt_service.core.config import load_config
-from hmt_service.core.geometry import identity, inverse, planar_pose, transform_points
+from hmt_service.core.geometry import (
+    GaussianPose,
+    identity,
+    inverse,
+    planar_covariance,
+    planar_pose,
+    transform_points,
+)
 from hmt_service.core.submap import Visit, as_points, visit_of
-from tests.core.factories import ROOM, cloud_of, keyframes_along, visit_along
+from tests.core.factories import ROOM, cloud_of, keyframes_along, motion_covariance, visit_along
 
 START = planar_pose(-1.5, -0.5, 0.3)
 PATH = [START @ planar_pose(0.4 * i, 0.1 * i, 0.2 * i) for i in range(8)]
@@ -97,3 +106,27 @@ def test_stored_points_are_single_precision() -> None:
     points = as_points(VISIT.points)
     assert points.dtype == np.float32
     assert points == pytest.approx(VISIT.points, abs=1e-6)
+
+
+def test_own_errors_cancel_along_the_path() -> None:
+    own = planar_covariance(motion_covariance(0.002, 0.01))
+    drift = planar_covariance(motion_covariance(0.0005, 0.001))
+    keyframes = [
+        replace(
+            keyframe,
+            own_error=own,
+            previous_from_body=GaussianPose(identity(), drift + 2.0 * own),
+        )
+        for keyframe in keyframes_along(ROOM, [identity()] * 21)
+    ]
+    visit = visit_of(0, keyframes, load_config())
+    ends = 2.0 * own[3, 3]
+    for count in (1, 5, 20):
+        variance = visit.visit_from_keyframe[count].covariance[3, 3]
+        assert variance == pytest.approx(ends + count * drift[3, 3], rel=1e-6)
+    # Cut in two and joined again, it is the same.
+    _, later, motion = visit.split(10)
+    assert motion.covariance[3, 3] == pytest.approx(ends + 10 * drift[3, 3], rel=1e-6)
+    assert later.visit_from_keyframe[-1].covariance[3, 3] == pytest.approx(
+        ends + 10 * drift[3, 3], rel=1e-6
+    )

@@ -5,6 +5,8 @@ import signal
 import threading
 import time
 from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -41,6 +43,12 @@ def save_area_count(engine: Engine, report: RunReport) -> tuple[str, ...]:
 
 def fail_to_save(_engine: Engine, _report: RunReport) -> tuple[str, ...]:
     raise OSError(28, "No space left on device")
+
+
+def append_trajectory(log: Path, engine: Engine, _report: RunReport) -> tuple[str, ...]:
+    with log.open("a") as file:
+        file.write(f"{len(engine.trajectory())} poses\n")
+    return ()
 
 
 def stumble(_engine: Engine, _report: RunReport) -> tuple[str, ...]:
@@ -230,6 +238,21 @@ def test_the_map_survives_the_odometry(running: Running) -> None:
     assert running.pipeline.is_alive(ProcessName.TOPOLOGY)
     assert running.pipeline.finish_map(Finish(7))
     assert running.recorder.wait() == Finished(7, ("1 areas of 20 scans",))
+
+
+@pytest.mark.parametrize(("is_urgent", "saves"), [(True, 1), (False, 2)])
+def test_the_map_is_saved_before_it_is_smoothed(
+    config: Config, tmp_path: Path, is_urgent: bool, saves: int
+) -> None:
+    log = tmp_path / "saved"
+    pipeline, recorder = Pipeline(config, save=partial(append_trajectory, log)), Recorder()
+    pipeline.start(recorder)
+    running = Running(pipeline, recorder)
+    running.feed(readings(60))
+    assert pipeline.finish(Finish(1, is_urgent))
+    recorder.wait()
+    assert log.read_text().splitlines() == ["60 poses"] * saves
+    assert pipeline.stop(5.0) == ()
 
 
 def test_submit_returns_false_instead_of_waiting_for_a_dead_process(running: Running) -> None:
