@@ -30,7 +30,7 @@ from hmt_service.core.geometry import (
     log,
     transform_points,
 )
-from hmt_service.core.graph import Factor, PoseGraph
+from hmt_service.core.graph import Factor, optimised
 from hmt_service.core.hypotheses import Hypothesis
 from hmt_service.core.local_map import LocalMap, SeenPoints, Sweep
 from hmt_service.core.submap import Visit
@@ -79,15 +79,11 @@ class Smoother:
         if not ties:
             return poses
         known = [*_motions(keyframes), *_alignments(hypothesis, visits)]
-        solved = self._solved(poses, known, ties)
+        solved = optimised(poses, _one_per_pair([*known, *ties]), is_planar=self._is_planar)
         agreed = [tie for tie in ties if _distance2(tie, solved) <= _GATE]
-        return solved if len(agreed) == len(ties) else self._solved(solved, known, agreed)
-
-    def _solved(
-        self, poses: FloatArray, known: Sequence[Factor], ties: Sequence[Factor]
-    ) -> FloatArray:
-        graph = PoseGraph.of(poses, [*known, *ties], is_planar=self._is_planar)
-        return np.array([graph.pose(index) for index in range(len(poses))])
+        if len(agreed) == len(ties):
+            return solved
+        return optimised(solved, _one_per_pair([*known, *agreed]), is_planar=self._is_planar)
 
     def _ties(self, keyframes: Sequence[Keyframe], poses: FloatArray) -> list[Factor]:
         """Return what each keyframe says of its pose among those of other times."""
@@ -187,6 +183,11 @@ def _alignments(hypothesis: Hypothesis, visits: Mapping[int, Visit]) -> list[Fac
         for factor in hypothesis.graph.factors
         if factor.visit_b != factor.visit_a + 1
     ]
+
+
+def _one_per_pair(factors: Sequence[Factor]) -> list[Factor]:
+    """Return the last factor of each pair of keyframes: two of one pair say the same twice."""
+    return list({(factor.visit_a, factor.visit_b): factor for factor in factors}.values())
 
 
 def _distance2(tie: Factor, poses: FloatArray) -> float:
