@@ -37,6 +37,12 @@ _SINGLE_BASIN_M = 0.25
 _SINGLE_BASIN_RAD = 0.05
 # How far a guess may be off; the prior of its registration, next to nothing.
 _BASIN_M, _BASIN_RAD = 1.0, 0.3
+_NEAR = isotropic_covariance(sigma_rad=1.0 / _BASIN_RAD, sigma_m=1.0 / _BASIN_M)
+# A guess is looked at with so few points first, and dropped if they explain less than this share of
+# the overlap that is asked for.
+_FEW_POINTS, _SCREENED = 200, 0.75
+# Searches are so much wider than asked for: the next hypothesis asks for almost the same.
+_MARGIN_M, _MARGIN_RAD = 1.0, 0.05
 _SEPARATION_M = 0.6
 _SEPARATION_RAD = 0.15
 _SEPARATION_SIGMA = 4.0
@@ -53,6 +59,49 @@ class Mode:
     """Share of the visit's points that the target explains there, in [0, 1]."""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Region:
+    """Where the middle of a visit may be, and how it may be turned."""
+
+    mean: Pose
+    """Pose of the visit in the middle of it, `target_from_visit`."""
+    centre: FloatArray
+    """Middle of the visit there, shape (3,), m."""
+    reach_m: float
+    """Radius of the circle around it."""
+    reach_rad: float
+    """Largest turn about the vertical to either side, up to pi."""
+
+    def holds(self, other: _Region) -> bool:
+        """Return whether all of another region is in this one."""
+        turn = abs(yaw_of(inverse(self.mean) @ other.mean))
+        apart_m = float(np.linalg.norm(self.centre[:2] - other.centre[:2]))
+        has_turns = self.reach_rad >= np.pi or turn + other.reach_rad <= self.reach_rad
+        return bool(has_turns and apart_m + other.reach_m <= self.reach_m)
+
+    def wider(self) -> _Region:
+        """Return this region with a margin."""
+        reach_rad = min(np.pi, self.reach_rad + _MARGIN_RAD)
+        return _Region(self.mean, self.centre, self.reach_m + _MARGIN_M, reach_rad)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Search:
+    region: _Region
+    guesses: list[Pose]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Known:
+    """What has been found out about one visit."""
+
+    visit: Visit
+    searches: dict[Visit, list[_Search]]
+    """Correlations with each target."""
+    refined: dict[tuple[Visit, bytes], Mode | None]
+    """What became of each guess for each target."""
+
+
 class Aligner:
     """Finds the modes of the relative pose of two submaps."""
 
@@ -65,6 +114,7 @@ class Aligner:
         self._config = config.alignment
         self._covariance = config.covariance
         self._is_planar = config.sensor.is_planar
+        self._known: _Known | None = None
 
     def modes(self, visit: Visit, target: Visit, prior: GaussianPose) -> tuple[Mode, ...]:
         """Return every pose inside the gate of the prior at which the submaps agree.
@@ -77,14 +127,13 @@ class Aligner:
         Returns:
             Distinct modes, the one with most overlap first; empty when nothing agrees.
         """
-        guesses = self._guesses(visit, target, prior)
-        least = self._config.min_overlap
-        refined = [
-            mode
-            for guess in guesses
-            if (mode := self.refine(visit, target, guess, min_overlap=least))
-        ]
-        refined = [mode for mode in refined if self._is_in_gate(mode, prior)]
+        if not (len(visit.points) and len(target.points)):
+            return ()
+        refined = []
+        for guess in self._guesses(visit, target, prior):
+            mode = self._refined(visit, target, guess)
+            if mode is not None and self._is_in_gate(mode, prior):
+                refined.append(mode)
         return self._distinct(refined)
 
     def refine(
@@ -98,6 +147,8 @@ class Aligner:
             guess: Pose to start from, `target_from_visit`.
             min_overlap: Least share of the visit's points that the target must explain.
         """
+        if not (len(visit.points) and len(target.points)):
+            return None
         near = isotropic_covariance(sigma_rad=_BASIN_RAD, sigma_m=_BASIN_M)
         prior = GaussianPose(guess, confined(near, is_planar=self._is_planar))
         fit = target.local_map.fit(visit.sweep, prior, certain(identity()), guess)
@@ -116,24 +167,52 @@ class Aligner:
         confined_covariance = confined(covariance, is_planar=self._is_planar)
         return Mode(GaussianPose(fit.pose, confined_covariance), fit.inlier_share)
 
+    def _refined(self, visit: Visit, target: Visit, guess: Pose) -> Mode | None:
+        """Return what `refine` does, for a guess that few points speak for, and only once."""
+        known = self._known_of(visit).refined
+        key = (target, guess.tobytes())
+        if key not in known:
+            least = self._config.min_overlap
+            few = visit.sweep.every(max(len(visit.sweep.points) // _FEW_POINTS, 1))
+            pose, share = target.local_map.glance(few, guess, _NEAR)
+            is_likely = share >= _SCREENED * least
+            known[key] = self.refine(visit, target, pose, min_overlap=least) if is_likely else None
+        return known[key]
+
+    def _known_of(self, visit: Visit) -> _Known:
+        """Return what has been found out about a visit; hypotheses ask the same again and again."""
+        if self._known is None or self._known.visit is not visit:
+            self._known = _Known(visit, {}, {})
+        return self._known
+
     def _guesses(self, visit: Visit, target: Visit, prior: GaussianPose) -> list[Pose]:
-        sigmas = np.sqrt(np.diag(prior.covariance))
         position = _position_covariance(prior, visit.centre)
         sigma_m = float(np.sqrt(np.linalg.eigvalsh(position)[-1]))
-        if sigma_m < _SINGLE_BASIN_M and sigmas[2] < _SINGLE_BASIN_RAD:
+        sigma_rad = float(np.sqrt(prior.covariance[2, 2]))
+        if sigma_m < _SINGLE_BASIN_M and sigma_rad < _SINGLE_BASIN_RAD:
             return [prior.mean]
-        return self._correlate(visit, target, prior, float(sigmas[2]), sigma_m)
+        gate = self._config.gate_sigma
+        region = _Region(
+            prior.mean,
+            transform_points(prior.mean, visit.centre[None])[0],
+            gate * sigma_m,
+            min(np.pi, gate * sigma_rad),
+        )
+        searches = self._known_of(visit).searches.setdefault(target, [])
+        for search in searches:
+            if search.region.holds(region):
+                return search.guesses
+        wider = region.wider()
+        searches.append(_Search(wider, self._correlate(visit, target, wider)))
+        return searches[-1].guesses
 
-    def _correlate(
-        self, visit: Visit, target: Visit, prior: GaussianPose, sigma_rad: float, sigma_m: float
-    ) -> list[Pose]:
+    def _correlate(self, visit: Visit, target: Visit, region: _Region) -> list[Pose]:
         """Return the best poses on a raster: correlation by FFT, one rotation at a time."""
         config = self._config
         cell = config.raster_m
-        reach_rad = min(np.pi, config.gate_sigma * sigma_rad)
-        reach_m = config.gate_sigma * sigma_m + cell
-        steps = int(np.ceil(reach_rad / config.angle_step_rad))
-        turns = np.unique(np.linspace(-reach_rad, reach_rad, 2 * steps + 1))
+        reach_m = region.reach_m + cell
+        steps = int(np.ceil(region.reach_rad / config.angle_step_rad))
+        turns = np.unique(np.linspace(-region.reach_rad, region.reach_rad, 2 * steps + 1))
 
         target_points = target.points[:, :2]
         low = target_points.min(axis=0) - cell
@@ -150,11 +229,10 @@ class Aligner:
         )
         spectrum = fft.rfft2(raster, shape)
         # Where the middle of the visit is expected to be in the target's frame.
-        expected = transform_points(prior.mean, visit.centre[None])[0]
         rows = low[0] + (np.arange(shape[0]) - extent + 0.5) * cell
         columns = low[1] + (np.arange(shape[1]) - extent + 0.5) * cell
-        is_inside = (rows[:, None] - expected[0]) ** 2 + (
-            columns[None, :] - expected[1]
+        is_inside = (rows[:, None] - region.centre[0]) ** 2 + (
+            columns[None, :] - region.centre[1]
         ) ** 2 <= reach_m**2
         if not np.any(is_inside):
             return []
@@ -165,17 +243,18 @@ class Aligner:
         )
         scores = []
         for turn in turns:
-            yaw = yaw_of(prior.mean) + turn
+            yaw = yaw_of(region.mean) + turn
             rotated = transform_points(planar_pose(0.0, 0.0, yaw), centred)[:, :2]
             stamp = np.zeros(shape, dtype=np.float32)
-            occupied = np.unique(np.round(rotated / cell).astype(int), axis=0)
-            stamp[occupied[:, 0] % shape[0], occupied[:, 1] % shape[1]] = 1.0 / len(occupied)
+            rows_hit, columns_hit = np.round(rotated / cell).astype(int).T
+            stamp[rows_hit % shape[0], columns_hit % shape[1]] = 1.0
+            stamp /= np.sum(stamp)
             score = fft.irfft2(spectrum * np.conj(fft.rfft2(stamp)), shape)
             # Index k stands for a shift by k cells, wrapped; row 0 of `rows` is shift -extent.
             score = np.roll(score, (extent, extent), axis=(0, 1))
             scores.append(np.where(is_inside, score, 0.0)[window].astype(np.float32))
         return self._peaks(
-            np.stack(scores), turns, rows[window[0]], columns[window[1]], visit, prior
+            np.stack(scores), turns, rows[window[0]], columns[window[1]], visit, region.mean
         )
 
     def _peaks(
@@ -185,7 +264,7 @@ class Aligner:
         rows: FloatArray,
         columns: FloatArray,
         visit: Visit,
-        prior: GaussianPose,
+        mean: Pose,
     ) -> list[Pose]:
         """Return the poses of the separate local maxima of the correlation, best first."""
         config = self._config
@@ -204,8 +283,8 @@ class Aligner:
         )
         poses = []
         for turn, row, column in found:
-            pose = prior.mean.copy()
-            pose[:3, :3] = planar_pose(0.0, 0.0, float(turns[turn]))[:3, :3] @ prior.mean[:3, :3]
+            pose = mean.copy()
+            pose[:3, :3] = planar_pose(0.0, 0.0, float(turns[turn]))[:3, :3] @ mean[:3, :3]
             centre = pose[:3, :3] @ visit.centre
             pose[:2, 3] = rows[row] - centre[0], columns[column] - centre[1]
             poses.append(pose)

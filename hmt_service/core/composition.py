@@ -45,8 +45,8 @@ def arcs_of(hypothesis: Hypothesis, motions: Sequence[Factor]) -> tuple[Arc, ...
     """
     fused: dict[tuple[int, int], tuple[GaussianPose, int]] = {}
     for motion in motions:
-        start = hypothesis.assignments[motion.visit_a]
-        end = hypothesis.assignments[motion.visit_b]
+        start = hypothesis.topology.assignments[motion.visit_a]
+        end = hypothesis.topology.assignments[motion.visit_b]
         if start.area == end.area:
             continue
         a_from_b = _aligned(start.area_from_visit) @ motion.a_from_b

@@ -21,7 +21,7 @@ from hmt_service.core.composition import arcs_of, compose_shortest_paths, residu
 from hmt_service.core.config import Config
 from hmt_service.core.geometry import FloatArray, GaussianPose, Pose, inverse, log
 from hmt_service.core.graph import Factor, PoseGraph
-from hmt_service.core.hypotheses import Assignment, Hypothesis, ParticleLayer
+from hmt_service.core.hypotheses import Assignment, Hypothesis, ParticleLayer, Topology
 from hmt_service.core.observation import ObservationModel
 from hmt_service.core.plausibility import Plausibility
 from hmt_service.core.refinement import Refinement
@@ -34,7 +34,7 @@ from hmt_service.core.stored import (
     StoredScan,
     StoredVisit,
 )
-from hmt_service.core.submap import Visit, as_points, visit_of
+from hmt_service.core.submap import Visit, Visits, as_points, visit_of
 from hmt_service.core.transition import Successor, Transition
 from hmt_service.core.types import (
     ArcResidual,
@@ -81,7 +81,7 @@ class Engine:
             negligible_mass=config.particles.negligible_mass,
             rng=rng,
         )
-        self._visits: dict[int, Visit] = {}
+        self._visits = Visits()
         self._motions: list[Factor] = []
         self._scans: list[StoredScan] = []
         self._tracked: Counter[str] = Counter()
@@ -121,9 +121,9 @@ class Engine:
             lost = _lost(keyframe, keyframe.failure, registration)
             if not self._is_dead_reckoning(keyframe):
                 return (lost, *self._enter(extended, len(self._open.keyframes)))
-            self._visits[extended.visit] = extended
+            self._visits.put(extended)
             return (lost, *self._divide(extended))
-        self._visits[extended.visit] = extended  # metric SLAM
+        self._visits.put(extended)  # metric SLAM
         events = self._weigh(keyframe)  # Eq. (12)
         return (*events, *self._divide(extended))
 
@@ -183,17 +183,18 @@ class Engine:
         return self._visits[len(self._visits) - 1]
 
     def _begin(self, keyframe: Keyframe) -> tuple[Event, ...]:
-        self._visits[0] = visit_of(0, (keyframe,), self._config)
+        self._visits.put(visit_of(0, (keyframe,), self._config))
         graph = PoseGraph(is_planar=self._config.sensor.is_planar)
         graph.add_reference(0)
-        first = Hypothesis(self._new_identifier(), 0.0, (Assignment(0, 0, None),), graph)
+        topology = Topology((Assignment(0, 0, None),))
+        first = Hypothesis(self._new_identifier(), 0.0, topology, graph)
         self._particles.replace([first])
         return (self._entered(keyframe.stamp_s),)
 
     def _enter(self, visit: Visit, first_of_new: int) -> tuple[Event, ...]:
         """Close the open visit at a border and expand every hypothesis over what lies beyond it."""
         closed, opened, motion = visit.split(first_of_new)
-        self._visits[closed.visit] = closed
+        self._visits.put(closed)
         self._unweigh(opened.keyframes)
         self._refine(closed)
         arc = Factor(closed.visit, opened.visit, motion)
@@ -203,7 +204,7 @@ class Engine:
             for hypothesis in self._particles.hypotheses
             for successor in self._expand(hypothesis, opened, arc)
         ]
-        self._visits[opened.visit] = opened
+        self._visits.put(opened)
         stamp_s = opened.keyframes[-1].stamp_s
         pruned = self._pruned(self._particles.replace(expanded), stamp_s)
         return (self._entered(stamp_s), *self._branched(len(expanded), stamp_s), *pruned)
@@ -333,8 +334,8 @@ class Engine:
             area_from_keyframe=best.area_from_visit(visit.visit) @ visit_from_keyframe,
             reference_from_keyframe=best.graph.relative(0, visit.visit) @ visit_from_keyframe,
             reference_area=0,
-            areas=len(best.areas),
-            arcs=best.arcs,
+            areas=len(best.topology.areas),
+            arcs=best.topology.arcs,
             keyframes=visit.last_keyframe + 1,
         )
 
@@ -362,19 +363,20 @@ class Engine:
         reference = self._reference(chosen, reference_area)
         arcs = arcs_of(chosen, self._motions)
         if method is MapMethod.CONSISTENT:
-            poses = {area: chosen.graph.relative(reference, area) for area in chosen.areas}
+            poses = {area: chosen.graph.relative(reference, area) for area in chosen.topology.areas}
         else:
             rng = np.random.default_rng([self._seed, self._revision])
             poses = compose_shortest_paths(arcs, reference, rng)
+        visits_to = chosen.topology.visits_to
         areas = tuple(
             PlacedArea(
                 area=area,
                 reference_from_area=poses[area],
-                keyframes=sum(len(self._visits[v].keyframes) for v in chosen.visits_to(area)),
-                visits=len(chosen.visits_to(area)),
+                keyframes=sum(len(self._visits[v].keyframes) for v in visits_to[area]),
+                visits=len(visits_to[area]),
                 points_in_area=self._submap(chosen, area) if with_points else _NO_POINTS,
             )
-            for area in chosen.areas
+            for area in chosen.topology.areas
         )
         return GlobalMap(
             method=method,
@@ -469,11 +471,12 @@ class Engine:
 
     @staticmethod
     def _reference(hypothesis: Hypothesis, area: int | None) -> int:
-        reference = hypothesis.areas[0] if area is None else area
-        if reference not in hypothesis.areas:
+        areas = hypothesis.topology.areas
+        reference = areas[0] if area is None else area
+        if reference not in areas:
             raise NotFound(
                 f"area {area} is not in hypothesis {hypothesis.hypothesis}, "
-                f"which has {len(hypothesis.areas)} areas: {list(hypothesis.areas)}"
+                f"which has {len(areas)} areas: {list(areas)}"
             )
         return reference
 
@@ -482,7 +485,7 @@ class Engine:
         area_from_reference = inverse(hypothesis.graph.pose(area))
         clouds = [
             self._visits[visit].points_in(area_from_reference @ hypothesis.graph.pose(visit))
-            for visit in hypothesis.visits_to(area)
+            for visit in hypothesis.topology.visits_to[area]
         ]
         return as_points(np.concatenate(clouds))
 
@@ -542,7 +545,8 @@ def _stored(hypothesis: Hypothesis) -> StoredHypothesis:
         hypothesis=hypothesis.hypothesis,
         log_weight=hypothesis.log_weight,
         assignments=tuple(
-            StoredAssignment(a.visit, a.area, a.area_from_visit) for a in hypothesis.assignments
+            StoredAssignment(a.visit, a.area, a.area_from_visit)
+            for a in hypothesis.topology.assignments
         ),
         reference_from_visit={v: hypothesis.graph.pose(v) for v in hypothesis.graph.visits},
         factors=tuple(

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -35,6 +36,42 @@ class Assignment:
     """Alignment with the founding visit; None when this visit founded the area."""
 
 
+@dataclass(frozen=True, eq=False)
+class Topology:
+    """Which area every visit was to; immutable, so that what follows from it is found once."""
+
+    assignments: tuple[Assignment, ...]
+    """One per visit, in time order: the topological path."""
+
+    @cached_property
+    def path(self) -> tuple[int, ...]:
+        """Areas in the order that they were entered."""
+        areas = [assignment.area for assignment in self.assignments]
+        return tuple(area for i, area in enumerate(areas) if i == 0 or areas[i - 1] != area)
+
+    @cached_property
+    def areas(self) -> tuple[int, ...]:
+        """All areas, in the order of their identifiers."""
+        return tuple(a.area for a in self.assignments if a.area_from_visit is None)
+
+    @cached_property
+    def arcs(self) -> int:
+        """Number of pairs of areas that the robot has gone between directly."""
+        return len({frozenset(pair) for pair in pairwise(self.path)})
+
+    @cached_property
+    def visits_to(self) -> Mapping[int, tuple[int, ...]]:
+        """Visits to each area, in time order."""
+        visits: dict[int, list[int]] = {}
+        for assignment in self.assignments:
+            visits.setdefault(assignment.area, []).append(assignment.visit)
+        return {area: tuple(each) for area, each in visits.items()}
+
+    def with_visit(self, assignment: Assignment) -> Topology:
+        """Return this topology with one more visit, or with another place for the last one."""
+        return Topology((*self.assignments[: assignment.visit], assignment))
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Hypothesis:
     """One topology of everything that the robot has travelled."""
@@ -43,51 +80,32 @@ class Hypothesis:
     """Identifier, unique in a run."""
     log_weight: float
     """Log of the posterior mass."""
-    assignments: tuple[Assignment, ...]
-    """One per visit, in time order: the topological path."""
+    topology: Topology
+    """What it says of all visits."""
     graph: PoseGraph
     """The metric graph that follows from it; owned, solved on demand."""
 
     @property
     def current(self) -> Assignment:
         """The assignment of the visit that the robot is on."""
-        return self.assignments[-1]
-
-    @property
-    def topological_path(self) -> tuple[int, ...]:
-        """Areas in the order that they were entered."""
-        areas = [assignment.area for assignment in self.assignments]
-        return tuple(area for i, area in enumerate(areas) if i == 0 or areas[i - 1] != area)
-
-    @property
-    def areas(self) -> tuple[int, ...]:
-        """All areas, in the order of their identifiers."""
-        return tuple(a.area for a in self.assignments if a.area_from_visit is None)
-
-    @property
-    def arcs(self) -> int:
-        """Number of pairs of areas that the robot has gone between directly."""
-        return len({frozenset(pair) for pair in pairwise(self.topological_path)})
-
-    def visits_to(self, area: int) -> tuple[int, ...]:
-        """Return the visits to an area, in time order."""
-        return tuple(a.visit for a in self.assignments if a.area == area)
+        return self.topology.assignments[-1]
 
     def area_from_visit(self, visit: int) -> GaussianPose:
         """Return the pose of a visit's frame in its area, with its own graph's covariance."""
-        area = self.assignments[visit].area
+        area = self.topology.assignments[visit].area
         if area == visit:
             return certain(identity())
         return self.graph.relative(area, visit)
 
     def keyframe_poses(self, visits: Mapping[int, Visit]) -> FloatArray:
         """Return the pose of every keyframe in the frame of the first visit, shape (K, 4, 4)."""
-        poses = [
-            self.graph.pose(visit.visit) @ pose.mean
-            for visit in visits.values()
-            for pose in visit.visit_from_keyframe
-        ]
-        return np.array(poses)
+        placed = self.graph.poses()
+        return np.concatenate(
+            [
+                placed[visit.visit] @ np.array([pose.mean for pose in visit.visit_from_keyframe])
+                for visit in visits.values()
+            ]
+        )
 
     def extended(
         self,
@@ -109,7 +127,7 @@ class Hypothesis:
         graph.add_factor(arc)
         if assignment.area_from_visit is not None:
             graph.add_factor(Factor(assignment.area, assignment.visit, assignment.area_from_visit))
-        return Hypothesis(hypothesis, log_weight, (*self.assignments, assignment), graph)
+        return Hypothesis(hypothesis, log_weight, self.topology.with_visit(assignment), graph)
 
 
 class ParticleLayer:
@@ -182,9 +200,9 @@ class ParticleLayer:
                 hypothesis=h.hypothesis,
                 probability=float(probability),
                 current_area=h.current.area,
-                topological_path=h.topological_path,
-                areas=len(h.areas),
-                loop_closures=len(h.assignments) - len(h.areas),
+                topological_path=h.topology.path,
+                areas=len(h.topology.areas),
+                loop_closures=len(h.topology.assignments) - len(h.topology.areas),
             )
             for h, probability in zip(self._hypotheses, self.probabilities, strict=True)
         )

@@ -41,11 +41,12 @@ _COARSE_SIGMA = 7.0
 # Robust kernels in standard deviations.
 _KERNEL, _COARSE_KERNEL = 4.0, 3.0
 _MAX_ITERATIONS = 30
+_GLANCE_ITERATIONS = 8
 # Beyond this last step, rad and m, the iteration has not converged; smaller ones are points that
 # change surfels back and forth.
 _MAX_LAST_STEP = 5e-3
-# Of the points of a LiDAR, the coarse cells need one in so many only.
-_SPARSE = 4
+# Of the points of a LiDAR, the coarse cells need one in so many only; of a plane's, so many.
+_SPARSE, _SPARSE_POINTS = 4, 400
 # Where the prediction explains less than half of the scan, and contradicts some of what the map
 # knows, headings up to so far from it are tried. What is found must explain half, and half as much
 # again as the prediction.
@@ -236,6 +237,34 @@ class LocalMap:
         least = max(_FOUND_SHARE, _BETTER * fit.inlier_share)
         return best if best.inlier_share >= least else fit
 
+    def glance(self, sweep: Sweep, start: Pose, information: FloatArray) -> tuple[Pose, float]:
+        """Return about where a scan fits near a pose, and the share of its points that do.
+
+        A few steps of `fit`, for guesses most of which are wrong.
+
+        Args:
+            sweep: A scan taken at once, N >= 1.
+            start: Where to start from.
+            information: Of that, shape (6, 6).
+        """
+        pose, fitting, nothing = np.ascontiguousarray(start), 0, np.zeros((6, 6))
+        for surfels, kernel in ((self._coarse, _COARSE_KERNEL), (self._fine, _KERNEL)):
+            pose, _, _, _, _, fitting, _ = gauss_newton(
+                surfels,
+                sweep.points,
+                sweep.lags,
+                sweep.views,
+                pose,
+                start,
+                information,
+                np.inf,
+                np.zeros(6),
+                nothing,
+                kernel**2,
+                _GLANCE_ITERATIONS,
+            )
+        return pose, fitting / len(sweep.points)
+
     def fit(self, sweep: Sweep, prior: GaussianPose, motion: GaussianPose, start: Pose) -> Fit:
         """Return where the scan fits near a pose, as `register` does."""
         axes = PLANAR_AXES if self._is_planar else np.arange(6)
@@ -247,7 +276,8 @@ class LocalMap:
             motion_information[:] = np.linalg.inv(motion.covariance)
         expected, expected_motion = np.ascontiguousarray(prior.mean), log(motion.mean)
         pose = np.ascontiguousarray(start)
-        sparse = sweep if self._is_planar else sweep.every(_SPARSE)
+        every = len(sweep.points) // _SPARSE_POINTS if self._is_planar else _SPARSE
+        sparse = sweep.every(every) if every > 1 else sweep
         for surfels, cloud, kernel in (
             (self._coarse, sparse, _COARSE_KERNEL),
             (self._fine, sweep, _KERNEL),

@@ -9,17 +9,16 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 
 from hmt_service.core.alignment import Aligner, Mode
 from hmt_service.core.config import Config
-from hmt_service.core.geometry import GaussianPose, transform_points
+from hmt_service.core.geometry import GaussianPose
 from hmt_service.core.graph import Factor
 from hmt_service.core.hypotheses import Hypothesis
-from hmt_service.core.submap import Visit
+from hmt_service.core.submap import Visit, Visits, gaps_m
 
 # chi-square 99.9 % for 6 degrees of freedom: a match beyond it contradicts the graph.
 _GATE = 22.46
@@ -38,9 +37,7 @@ class Refinement:
         self._config = config.refinement
         self._aligner = aligner
 
-    def refine(
-        self, hypothesis: Hypothesis, visit: Visit, visits: Mapping[int, Visit]
-    ) -> Hypothesis:
+    def refine(self, hypothesis: Hypothesis, visit: Visit, visits: Visits) -> Hypothesis:
         """Return the hypothesis with the arcs that all of the visit's observations support.
 
         Args:
@@ -48,7 +45,8 @@ class Refinement:
             visit: The visit that is over.
             visits: All visits up to and including it.
         """
-        founder = hypothesis.assignments[visit.visit].area
+        assignment = hypothesis.topology.assignments[visit.visit]
+        founder = assignment.area
         ties: list[tuple[int, Mode]] = []
         for other in self._neighbours(hypothesis, visit, visits, founder):
             prior = hypothesis.graph.relative(other, visit.visit)
@@ -62,7 +60,6 @@ class Refinement:
         if not ties:
             return hypothesis
         graph = hypothesis.graph.copy()
-        assignments = list(hypothesis.assignments)
         for other, mode in ties:
             # All ties share the visit's own points and bends: together they are worth one.
             tie = GaussianPose(
@@ -70,27 +67,21 @@ class Refinement:
             )
             graph.add_factor(Factor(other, visit.visit, tie))
             if other == founder:
-                assignments[visit.visit] = replace(
-                    assignments[visit.visit], area_from_visit=mode.target_from_visit
-                )
-        return replace(hypothesis, graph=graph, assignments=tuple(assignments))
+                assignment = replace(assignment, area_from_visit=mode.target_from_visit)
+        topology = hypothesis.topology.with_visit(assignment)
+        return replace(hypothesis, graph=graph, topology=topology)
 
     def _neighbours(
-        self, hypothesis: Hypothesis, visit: Visit, visits: Mapping[int, Visit], founder: int
+        self, hypothesis: Hypothesis, visit: Visit, visits: Visits, founder: int
     ) -> list[int]:
         """Return the visits near enough to overlap, the founder of the visit's area first."""
-        graph = hypothesis.graph
-        centre = transform_points(graph.pose(visit.visit), visit.centre[None])[0]
-        near = []
-        for other in visits.values():
-            # The visit just before is tied by the motion, from the same observations.
-            if other.visit >= visit.visit - 1:
-                continue
-            there = transform_points(graph.pose(other.visit), other.centre[None])[0]
-            gap = float(np.linalg.norm(there - centre)) - other.radius_m - visit.radius_m
-            if gap <= self._config.max_gap_m:
-                near.append((other.visit != founder, gap, other.visit))
-        return [other for _, _, other in sorted(near)[: self._config.max_neighbours]]
+        # The visit just before is tied by the motion, from the same observations.
+        others = max(visit.visit - 1, 0)
+        poses = hypothesis.graph.poses()
+        gaps = gaps_m(visit, poses[visit.visit], poses[:others], visits.extents(others))
+        near = np.flatnonzero(gaps <= self._config.max_gap_m)
+        ordered = sorted((int(v) != founder, float(gaps[v]), int(v)) for v in near)
+        return [other for _, _, other in ordered[: self._config.max_neighbours]]
 
     def _is_certain(self, prior: GaussianPose) -> bool:
         config = self._config

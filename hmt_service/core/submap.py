@@ -10,7 +10,7 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -148,7 +148,9 @@ class Visit:
 
     @cached_property
     def reach_m(self) -> float:
-        """Distance from the centre within which nine in ten of the submap's points lie."""
+        """Distance from the centre within which nine in ten of the submap's points lie, or 0."""
+        if not len(self.points):
+            return 0.0
         return float(np.quantile(np.linalg.norm(self.points - self.centre, axis=1), 0.9))
 
     def with_keyframe(self, keyframe: Keyframe) -> Visit:
@@ -178,6 +180,61 @@ class Visit:
         later = visit_of(self.visit + 1, self.keyframes[first_of_new:], self.config)
         last, new = earlier.keyframes[-1], later.keyframes[0]
         return earlier, later, _chained(earlier.visit_from_keyframe[-1], last, new)
+
+
+class Visits(Mapping[int, Visit]):
+    """All visits by their numbers, in time order, and where each lies in its own frame."""
+
+    def __init__(self, visits: Iterable[Visit] = ()) -> None:
+        """Take some visits, numbered from 0."""
+        self._visits: list[Visit] = []
+        self._extents = np.zeros((0, 5))
+        for visit in visits:
+            self.put(visit)
+
+    def __getitem__(self, visit: int) -> Visit:
+        """Return one visit."""
+        return self._visits[visit]
+
+    def __iter__(self) -> Iterator[int]:
+        """Iterate over the numbers."""
+        return iter(range(len(self._visits)))
+
+    def __len__(self) -> int:
+        """Return the number of visits."""
+        return len(self._visits)
+
+    def put(self, visit: Visit) -> None:
+        """Add the next visit, or replace one that has become longer or shorter."""
+        if visit.visit == len(self._visits):
+            self._visits.append(visit)
+        else:
+            self._visits[visit.visit] = visit
+            self._extents = self._extents[: visit.visit]
+
+    def extents(self, count: int) -> FloatArray:
+        """Return centre, radius and reach of the first so many visits, shape (count, 5), m."""
+        new = [
+            [*visit.centre, visit.radius_m, visit.reach_m]
+            for visit in self._visits[len(self._extents) : count]
+        ]
+        if new:
+            self._extents = np.concatenate([self._extents, new])
+        return self._extents[:count]
+
+
+def gaps_m(visit: Visit, here: Pose, poses: FloatArray, extents: FloatArray) -> FloatArray:
+    """Return how far keyframes of a visit are from those of others at least, shape (N,), m.
+
+    Args:
+        visit: The visit.
+        here: Its pose.
+        poses: Those of the others, in the same frame, shape (N, 4, 4).
+        extents: Those of the others, shape (N, 5).
+    """
+    centres = np.einsum("nij,nj->ni", poses[:, :3, :3], extents[:, :3]) + poses[:, :3, 3]
+    offsets = centres - transform_points(here, visit.centre[None])
+    return np.asarray(np.linalg.norm(offsets, axis=1) - extents[:, 3] - visit.radius_m)
 
 
 def _chained(visit_from_last: GaussianPose, last: Keyframe, new: Keyframe) -> GaussianPose:

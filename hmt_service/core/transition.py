@@ -20,12 +20,14 @@ from hmt_service.core.geometry import (
     exp,
     inverse,
     log,
-    transform_points,
 )
 from hmt_service.core.graph import Factor
 from hmt_service.core.hypotheses import Hypothesis
 from hmt_service.core.observation import ObservationModel
-from hmt_service.core.submap import Visit
+from hmt_service.core.submap import Visit, Visits, gaps_m
+
+# So many times as many areas are looked at as may be candidates.
+_ASKED = 4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,7 +75,7 @@ class Transition:
         self._rng = rng
 
     def successors(
-        self, hypothesis: Hypothesis, visit: Visit, arc: Factor, visits: Mapping[int, Visit]
+        self, hypothesis: Hypothesis, visit: Visit, arc: Factor, visits: Visits
     ) -> tuple[Successor, ...]:
         """Return every place that the new visit may be to.
 
@@ -97,22 +99,27 @@ class Transition:
         return tuple(result)
 
     def _candidates(
-        self, hypothesis: Hypothesis, visit: Visit, arc: Factor, visits: Mapping[int, Visit]
+        self, hypothesis: Hypothesis, visit: Visit, arc: Factor, visits: Visits
     ) -> list[_Candidate]:
         """Return the areas whose extent the prior reaches, the nearest first."""
+        most, graph = self._config.max_candidates, hypothesis.graph
+        areas = np.array([a for a in hypothesis.topology.areas if a != hypothesis.current.area])
+        if not len(areas):
+            return []
+        extents = visits.extents(visit.visit)[areas]
+        here = graph.pose(arc.visit_a) @ arc.a_from_b.mean
+        margins = self._config.margin_share * extents[:, 4]
+        distances = gaps_m(visit, here, graph.poses()[areas], extents) - margins
         result = []
-        for area in hypothesis.areas:
-            if area == hypothesis.current.area:
-                continue
-            target = visits[area]
-            prior = hypothesis.graph.relative(area, arc.visit_a) @ arc.a_from_b
-            offset = transform_points(prior.mean, visit.centre[None])[0] - target.centre
-            margin = self._config.margin_share * target.reach_m
-            distance = float(np.linalg.norm(offset)) - target.radius_m - visit.radius_m - margin
+        # How well a place is known is asked of the nearest only: it costs more than all else here.
+        for index in np.argsort(distances, kind="stable")[: _ASKED * most]:
+            area, distance = int(areas[index]), float(distances[index])
+            prior = graph.relative(area, arc.visit_a) @ arc.a_from_b
             if distance <= self._gate_sigma * prior.sigma_m:
                 result.append(_Candidate(area, prior, distance))
-        result.sort(key=lambda candidate: (candidate.distance_m, candidate.area))
-        return result[: self._config.max_candidates]
+                if len(result) == most:
+                    break
+        return result
 
     def _mass_outside(
         self, candidates: list[_Candidate], visit: Visit, visits: Mapping[int, Visit]

@@ -154,3 +154,14 @@ def test_same_submaps_give_the_same_bytes() -> None:
     assert [m.target_from_visit.mean.tobytes() for m in first] == [
         m.target_from_visit.mean.tobytes() for m in second
     ]
+
+
+def test_nothing_aligns_with_a_submap_without_points() -> None:
+    start = planar_pose(500.0, 0.0, 0.0)
+    empty = visit_along(ROOM, [start, start @ planar_pose(0.3, 0.0, 0.0)], visit=1)
+    assert len(empty.points) == 0
+    assert empty.reach_m == 0.0
+    wide = gaussian(TRUTH, sigma_rad=ANY_HEADING_RAD, sigma_m=3.0)
+    assert ALIGNER.modes(empty, TARGET, wide) == ALIGNER.modes(VISIT, empty, wide) == ()
+    assert ALIGNER.refine(empty, TARGET, TRUTH, min_overlap=0.0) is None
+    assert ALIGNER.refine(VISIT, empty, TRUTH, min_overlap=0.0) is None

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from hmt_service.core.composition import arcs_of, compose_shortest_paths, residual_m
 from hmt_service.core.geometry import GaussianPose, Pose, certain, identity, inverse, planar_pose
 from hmt_service.core.graph import Factor, PoseGraph
-from hmt_service.core.hypotheses import Assignment, Hypothesis
+from hmt_service.core.hypotheses import Assignment, Hypothesis, Topology
 from hmt_service.core.types import Arc
 from tests.core.factories import gaussian
 
@@ -20,7 +20,7 @@ from tests.core.factories import gaussian
 def travelled(*steps: tuple[int, GaussianPose | None]) -> Hypothesis:
     """Return a hypothesis of visits to these areas; the graph plays no part."""
     assignments = tuple(Assignment(i, area, pose) for i, (area, pose) in enumerate(steps))
-    return Hypothesis(0, 0.0, assignments, PoseGraph(is_planar=True))
+    return Hypothesis(0, 0.0, Topology(assignments), PoseGraph(is_planar=True))
 
 
 def arc(area_a: int, area_b: int, mean: Pose, *, sigma_m: float = 0.05) -> Arc:

@@ -16,6 +16,7 @@ from hmt_service.core.hypotheses import (
     Assignment,
     Hypothesis,
     ParticleLayer,
+    Topology,
     optimal_resampling,
 )
 from tests.core.factories import gaussian
@@ -24,7 +25,7 @@ from tests.core.factories import gaussian
 def hypothesis_of(identifier: int, weight: float) -> Hypothesis:
     graph = PoseGraph(is_planar=True)
     graph.add_reference(0)
-    return Hypothesis(identifier, math.log(weight), (Assignment(0, 0, None),), graph)
+    return Hypothesis(identifier, math.log(weight), Topology((Assignment(0, 0, None),)), graph)
 
 
 def layer_of(
@@ -166,9 +167,9 @@ def travelled() -> Hypothesis:
 
 def test_loop_closure_is_counted_and_ties_the_graph() -> None:
     hypothesis = travelled()
-    assert hypothesis.topological_path == (0, 1, 0)
-    assert hypothesis.areas == (0, 1)
-    assert hypothesis.visits_to(0) == (0, 2)
+    assert hypothesis.topology.path == (0, 1, 0)
+    assert hypothesis.topology.areas == (0, 1)
+    assert hypothesis.topology.visits_to[0] == (0, 2)
     assert [(f.visit_a, f.visit_b) for f in hypothesis.graph.factors] == [(0, 1), (0, 2), (1, 2)]
     layer = ParticleLayer(budget=2, negligible_mass=1e-6, rng=np.random.default_rng(0))
     layer.replace([hypothesis])
@@ -192,7 +193,7 @@ def test_successors_leave_their_parent_as_it_was() -> None:
     assert new.graph.pose(3)[0, 3] != pytest.approx(known.graph.pose(3)[0, 3], abs=0.01)
     assert parent.graph.visits == (0, 1, 2)
     assert [parent.graph.pose(visit).tolist() for visit in parent.graph.visits] == before
-    assert (new.areas, known.areas) == ((0, 1, 3), (0, 1))
+    assert (new.topology.areas, known.topology.areas) == ((0, 1, 3), (0, 1))
 
 
 def test_staying_in_an_area_does_not_lengthen_the_topological_path() -> None:
@@ -202,5 +203,5 @@ def test_staying_in_an_area_does_not_lengthen_the_topological_path() -> None:
         hypothesis=3,
         log_weight=0.0,
     )
-    assert stayed.topological_path == (0, 1, 0)
-    assert stayed.visits_to(0) == (0, 2, 3)
+    assert stayed.topology.path == (0, 1, 0)
+    assert stayed.topology.visits_to[0] == (0, 2, 3)

@@ -9,9 +9,9 @@ from hmt_service.core.alignment import Aligner
 from hmt_service.core.config import Config, load_config
 from hmt_service.core.geometry import Pose, identity, inverse, log, planar_pose
 from hmt_service.core.graph import Factor, PoseGraph
-from hmt_service.core.hypotheses import Assignment, Hypothesis
+from hmt_service.core.hypotheses import Assignment, Hypothesis, Topology
 from hmt_service.core.refinement import Refinement
-from hmt_service.core.submap import Visit
+from hmt_service.core.submap import Visit, Visits
 from tests.core.factories import ROOM, SQUARE, box, gaussian, line, visit_along
 
 FAR = np.concatenate([box(40.0, -2.0, 48.0, 2.0), box(42.0, -1.0, 43.0, 1.0)])
@@ -49,7 +49,9 @@ def believed(
         aligned = gaussian(loop)
         graph.add_factor(Factor(0, 2, aligned))
         last = Assignment(2, 0, aligned)
-    return Hypothesis(0, 0.0, (Assignment(0, 0, None), Assignment(1, 1, None), last), graph)
+    return Hypothesis(
+        0, 0.0, Topology((Assignment(0, 0, None), Assignment(1, 1, None), last)), graph
+    )
 
 
 def is_tied(hypothesis: Hypothesis, visit_a: int, visit_b: int) -> bool:
@@ -61,7 +63,7 @@ def refined(
 ) -> Hypothesis:
     config = config or load_config()
     known = visits or VISITS
-    return Refinement(config, Aligner(config)).refine(hypothesis, known[2], known)
+    return Refinement(config, Aligner(config)).refine(hypothesis, known[2], Visits(known.values()))
 
 
 def test_overlapping_visits_are_tied_where_they_align() -> None:
@@ -87,8 +89,8 @@ def test_topology_is_not_decided_here() -> None:
     hypothesis = believed()
     result = refined(hypothesis)
     assert is_tied(result, 0, 2)
-    assert result.topological_path == hypothesis.topological_path == (0, 1, 2)
-    assert result.assignments[2].area_from_visit is None
+    assert result.topology.path == hypothesis.topology.path == (0, 1, 2)
+    assert result.topology.assignments[2].area_from_visit is None
     assert result.log_weight == hypothesis.log_weight
 
 
@@ -96,11 +98,11 @@ def test_alignment_with_its_own_area_is_replaced_by_the_better_one() -> None:
     rough = TRUTH @ planar_pose(0.04, 0.03, 0.0)
     hypothesis = believed(loop=rough)
     result = refined(hypothesis)
-    aligned = result.assignments[2].area_from_visit
+    aligned = result.topology.assignments[2].area_from_visit
     assert aligned is not None
     assert np.abs(log(inverse(TRUTH) @ aligned.mean)).max() < 0.01
     assert len(result.graph.factors) == len(hypothesis.graph.factors) == 3
-    assert result.topological_path == (0, 1, 0)
+    assert result.topology.path == (0, 1, 0)
 
 
 @pytest.mark.parametrize("sigma_m", [0.6, 2.0])
@@ -126,7 +128,9 @@ def test_visit_just_before_is_not_tied_twice() -> None:
         motion = gaussian(inverse(starts[a]) @ starts[a + 1], sigma_rad=0.002)
         graph.add_factor(Factor(a, a + 1, motion))
     before = graph.factors[1].a_from_b
-    hypothesis = Hypothesis(0, 0.0, tuple(Assignment(i, i, None) for i in range(3)), graph)
+    hypothesis = Hypothesis(
+        0, 0.0, Topology(tuple(Assignment(i, i, None) for i in range(3))), graph
+    )
     result = refined(hypothesis, visits)
     assert result is hypothesis
     assert result.graph.factors[1].a_from_b is before

@@ -17,7 +17,7 @@ from hmt_service.core.geometry import (
     planar_pose,
 )
 from hmt_service.core.graph import Factor, PoseGraph
-from hmt_service.core.hypotheses import Assignment, Hypothesis
+from hmt_service.core.hypotheses import Assignment, Hypothesis, Topology
 from hmt_service.core.smoothing import Smoother
 from hmt_service.core.submap import Visit, visit_of
 from tests.core.factories import ROOM, keyframes_along, motion_covariance
@@ -45,7 +45,7 @@ def hypothesis_of(visits: Sequence[Visit]) -> Hypothesis:
     graph = PoseGraph(is_planar=True)
     graph.add_reference(0)
     graph.add_factor(Factor(0, 1, last))
-    return Hypothesis(0, 0.0, (Assignment(0, 0, None), Assignment(1, 1, None)), graph)
+    return Hypothesis(0, 0.0, Topology((Assignment(0, 0, None), Assignment(1, 1, None))), graph)
 
 
 def errors_m(poses: Sequence[Pose] | np.ndarray, path: Sequence[Pose]) -> np.ndarray:

@@ -12,9 +12,9 @@ from hmt_service.core.alignment import Aligner, Mode
 from hmt_service.core.config import load_config
 from hmt_service.core.geometry import GaussianPose, Pose, identity, inverse, log, planar_pose
 from hmt_service.core.graph import Factor, PoseGraph
-from hmt_service.core.hypotheses import Assignment, Hypothesis
+from hmt_service.core.hypotheses import Assignment, Hypothesis, Topology
 from hmt_service.core.observation import ObservationModel
-from hmt_service.core.submap import Visit
+from hmt_service.core.submap import Visit, Visits
 from hmt_service.core.transition import Successor, Transition
 from tests.core.factories import ROOM, Walls, box, gaussian, line, visit_along
 
@@ -37,7 +37,7 @@ def explored(*paths: Sequence[Pose], sigma_m: float = 0.1) -> tuple[Hypothesis, 
         step = inverse(paths[i - 1][0]) @ paths[i][0]
         graph.add_factor(Factor(i - 1, i, gaussian(step, sigma_m=sigma_m, sigma_rad=0.02)))
     assignments = tuple(Assignment(i, i, None) for i in visits)
-    return Hypothesis(0, 0.0, assignments, graph), visits
+    return Hypothesis(0, 0.0, Topology(assignments), graph), visits
 
 
 def successors_of(
@@ -59,7 +59,7 @@ def successors_of(
     rng = np.random.default_rng(seed)
     transition = Transition(CONFIG, aligner or Aligner(CONFIG), observation, rng)
     arc = Factor(len(visits) - 1, len(visits), gaussian(motion, sigma_m=sigma_m, sigma_rad=0.02))
-    return transition.successors(hypothesis, visit, arc, visits)
+    return transition.successors(hypothesis, visit, arc, Visits(visits.values()))
 
 
 class NoAligner(Aligner):
