@@ -133,16 +133,16 @@ class AreaConfig(Section):
 class AlignmentConfig(Section):
     """Search for the relative poses of two submaps, and their refinement."""
 
-    raster_m: float = Field(default=0.2, gt=0.0)
+    raster_m: float = Field(default=0.4, gt=0.0)
     """Edge of a cell of the bird's-eye views that are correlated."""
-    angle_step_rad: float = Field(default=0.05, gt=0.0)
+    angle_step_rad: float = Field(default=0.1, gt=0.0)
     """Step of the rotations that are tried."""
     gate_sigma: float = Field(default=3.5, gt=0.0)
     """Size of the search region in standard deviations of the prior."""
     max_modes: int = Field(default=4, ge=1)
     """Most poses kept per pair of submaps."""
     min_overlap: float = Field(default=0.45, ge=0.0, le=1.0)
-    """Least share of a visit's submap that the other must explain at a pose."""
+    """Least share of what a visit has seen that a known area must explain."""
 
 
 class TransitionConfig(Section):
@@ -193,6 +193,11 @@ class ParticleConfig(Section):
     """Most hypotheses kept."""
     negligible_mass: float = Field(default=1e-6, gt=0.0, lt=1.0)
     """Hypotheses below this posterior mass are dropped."""
+    unlikely_mass: float = Field(default=1e-3, gt=0.0, lt=1.0)
+    """A hypothesis below this posterior mass is unlikely."""
+    patience_areas: int = Field(default=8, ge=1)
+    """One that stays unlikely for so many entries of areas in a row is dropped: nothing speaks for
+    it, and it would be extended at the cost of the best."""
 
 
 class Config(Section):
@@ -272,7 +277,7 @@ _PRESETS: dict[Preset, dict[str, Any]] = {
             "max_correction_m": 2.0,
         },
         "areas": {"cell_size_m": 0.5},
-        "alignment": {"raster_m": 0.25},
+        "alignment": {"raster_m": 0.5},
         "observation": {"hit_sigma_m": 0.2, "angular_resolution_rad": 0.035},
     },
 }

@@ -163,14 +163,16 @@ class Engine:
         Returns:
             What was decided.
         """
+        events: tuple[Event, ...] = ()
         if self._revision > self._finished_revision:
             self._refine(self._open)
+            events = self._recognise(self._open, self._open.keyframes[-1].stamp_s)
             self._revision += 1
             self._finished_revision = self._revision
         if self._visits and not is_urgent and self._smooth_poses() is None:
             poses = self._smoother.smooth(self._particles.best, self._visits)
             self._smoothed = self._revision, poses
-        return ()
+        return events
 
     def _smooth_poses(self) -> FloatArray | None:
         """Return the smoothed poses of all keyframes, unless the map has changed since."""
@@ -197,6 +199,8 @@ class Engine:
         self._visits.put(closed)
         self._unweigh(opened.keyframes)
         self._refine(closed)
+        stamp_s = opened.keyframes[-1].stamp_s
+        recognised = (*self._forget(stamp_s), *self._recognise(closed, stamp_s))
         arc = Factor(closed.visit, opened.visit, motion)
         self._motions.append(arc)
         expanded = [
@@ -205,9 +209,48 @@ class Engine:
             for successor in self._expand(hypothesis, opened, arc)
         ]
         self._visits.put(opened)
-        stamp_s = opened.keyframes[-1].stamp_s
         pruned = self._pruned(self._particles.replace(expanded), stamp_s)
-        return (self._entered(stamp_s), *self._branched(len(expanded), stamp_s), *pruned)
+        branched = self._branched(len(expanded), stamp_s)
+        return (*recognised, self._entered(stamp_s), *branched, *pruned)
+
+    def _forget(self, stamp_s: float) -> tuple[Event, ...]:
+        """Drop what nothing has spoken for since long, and accept what alone is left."""
+        particles = self._config.particles
+        dropped = self._particles.forget(
+            unlikely_mass=particles.unlikely_mass, patience=particles.patience_areas
+        )
+        if not dropped or len(self._particles.hypotheses) > 1:
+            return self._pruned(dropped, stamp_s)
+        best = self._particles.best
+        numbers = {"hypothesis": float(best.hypothesis), "areas": float(len(best.topology.areas))}
+        message = f"accepted hypothesis {best.hypothesis}: no other is left"
+        accepted = Event(EventKind.ACCEPTED, stamp_s, message, numbers)
+        return (*self._pruned(dropped, stamp_s), accepted)
+
+    def _recognise(self, visit: Visit, stamp_s: float) -> tuple[Event, ...]:
+        """Branch over where else in the map what a finished visit has seen may be."""
+        known = self._particles.hypotheses
+        recognising = [
+            hypothesis.recognising(
+                match.area,
+                match.area_from_visit,
+                is_same_area=match.overlap >= _SAME_AREA,
+                hypothesis=self._new_identifier(),
+                log_weight=hypothesis.log_weight + match.log_factor,
+            )
+            for hypothesis in known
+            for match in self._transition.recognitions(hypothesis, visit, self._visits)
+            if match.area is not None and match.area_from_visit is not None
+            if not any(
+                other.has_recognised(hypothesis, match.area, match.area_from_visit.mean)
+                for other in known
+            )
+        ]
+        if not recognising:
+            return ()
+        expanded = [*known, *recognising]
+        pruned = self._pruned(self._particles.replace(expanded), stamp_s)
+        return (*self._branched(len(expanded), stamp_s), *pruned)
 
     def _expand(self, hypothesis: Hypothesis, visit: Visit, arc: Factor) -> list[Hypothesis]:
         """Return one hypothesis per place that the visit may be to, Eq. (6)."""
@@ -491,6 +534,8 @@ class Engine:
 
 
 _ANY_CUT = 2.0
+# A visit was to an area, and did not only see into it, if the area explains so much of it.
+_SAME_AREA = 2.0 / 3.0
 # A gap that the wheels bridge so well is none.
 _BRIDGED_M = 0.25
 _NO_POINTS: Points = np.zeros((0, 3), dtype=np.float32)

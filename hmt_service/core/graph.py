@@ -279,6 +279,10 @@ class PoseGraph:
         self._factors[key] = self._pending[key] = factor
         self._visits.setdefault(factor.visit_b)
 
+    def has_arc(self, visit_a: int, visit_b: int) -> bool:
+        """Return whether there is an arc between two visits."""
+        return _key(visit_a, visit_b) in self._factors
+
     def pose(self, visit: int) -> Pose:
         """Return the globally consistent pose of a visit's frame, shape (4, 4)."""
         return self._solved().pose(visit)

@@ -18,10 +18,21 @@ from itertools import pairwise
 
 import numpy as np
 
-from hmt_service.core.geometry import FloatArray, GaussianPose, certain, identity
+from hmt_service.core.geometry import (
+    FloatArray,
+    GaussianPose,
+    Pose,
+    certain,
+    identity,
+    inverse,
+    log,
+)
 from hmt_service.core.graph import Factor, PoseGraph
 from hmt_service.core.submap import Visit
 from hmt_service.core.types import HypothesisSummary
+
+# Poses of one visit that are no farther apart are one.
+_SAME_M, _SAME_RAD = 0.6, 0.15
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,6 +95,8 @@ class Hypothesis:
     """What it says of all visits."""
     graph: PoseGraph
     """The metric graph that follows from it; owned, solved on demand."""
+    unlikely_for: int = 0
+    """Number of areas entered since it was likely."""
 
     @property
     def current(self) -> Assignment:
@@ -127,7 +140,43 @@ class Hypothesis:
         graph.add_factor(arc)
         if assignment.area_from_visit is not None:
             graph.add_factor(Factor(assignment.area, assignment.visit, assignment.area_from_visit))
-        return Hypothesis(hypothesis, log_weight, self.topology.with_visit(assignment), graph)
+        topology = self.topology.with_visit(assignment)
+        return Hypothesis(hypothesis, log_weight, topology, graph, self.unlikely_for)
+
+    def recognising(
+        self,
+        area: int,
+        area_from_visit: GaussianPose,
+        *,
+        is_same_area: bool,
+        hypothesis: int,
+        log_weight: float,
+    ) -> Hypothesis:
+        """Return a successor whose last visit, to a new area, saw what an older area has seen.
+
+        Args:
+            area: The older area.
+            area_from_visit: Where the visit is in it.
+            is_same_area: Whether the visit was to that area, and not to one that sees into it.
+            hypothesis: Identifier of the successor.
+            log_weight: Its log weight, not normalised.
+        """
+        visit, topology, graph = self.current.visit, self.topology, self.graph.copy()
+        graph.add_factor(Factor(area, visit, area_from_visit))
+        if is_same_area:
+            topology = topology.with_visit(Assignment(visit, area, area_from_visit))
+        return Hypothesis(hypothesis, log_weight, topology, graph, self.unlikely_for)
+
+    def has_recognised(self, other: Hypothesis, area: int, area_from_visit: Pose) -> bool:
+        """Return whether this is another hypothesis but that it ties the last visit there."""
+        visit = self.current.visit
+        if not self.graph.has_arc(area, visit):
+            return False
+        if self.topology.assignments[:visit] != other.topology.assignments[:visit]:
+            return False
+        placed = inverse(self.graph.pose(area)) @ self.graph.pose(visit)
+        moved = log(inverse(area_from_visit) @ placed)
+        return bool(np.linalg.norm(moved[3:]) <= _SAME_M and np.linalg.norm(moved[:3]) <= _SAME_RAD)
 
 
 class ParticleLayer:
@@ -192,6 +241,24 @@ class ParticleLayer:
         return self.replace(
             [replace(h, log_weight=h.log_weight + log_likelihood(h)) for h in self._hypotheses]
         )
+
+    def forget(self, *, unlikely_mass: float, patience: int) -> tuple[Hypothesis, ...]:
+        """Drop what has been unlikely for long; to be called once per area entered.
+
+        Args:
+            unlikely_mass: Posterior mass below which a hypothesis is unlikely.
+            patience: Number of areas for which it may be.
+
+        Returns:
+            The hypotheses that were dropped.
+        """
+        aged = [
+            replace(h, unlikely_for=h.unlikely_for + 1 if probability < unlikely_mass else 0)
+            for h, probability in zip(self._hypotheses, self.probabilities, strict=True)
+        ]
+        kept = [h for h in aged if h.unlikely_for <= patience]
+        self.replace(kept)
+        return tuple(h for h in aged if h.unlikely_for > patience)
 
     def summaries(self) -> tuple[HypothesisSummary, ...]:
         """Return what readers may know of each hypothesis, the most probable first."""

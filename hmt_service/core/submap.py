@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from itertools import pairwise
 
 import numpy as np
@@ -36,6 +36,8 @@ from hmt_service.core.types import Keyframe, Points
 
 # Size of the cells that a submap keeps one point of, over those of the local map.
 _SUBMAP_CELLS = 0.5
+# Surfels take several times what the points do: so many local maps are kept, the last used.
+_LOCAL_MAPS = 24
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,10 +118,10 @@ class Visit:
         """Return the submap in another frame, shape (N, 3), m."""
         return transform_points(frame_from_visit, self.points)
 
-    @cached_property
+    @property
     def local_map(self) -> LocalMap:
         """The submap, ready to register others in it."""
-        return LocalMap.of(self.seen, self.config, sigma_m=self.config.covariance.sigma_submap_m)
+        return _local_map_of(self)
 
     @cached_property
     def bend(self) -> FloatArray:
@@ -180,6 +182,11 @@ class Visit:
         later = visit_of(self.visit + 1, self.keyframes[first_of_new:], self.config)
         last, new = earlier.keyframes[-1], later.keyframes[0]
         return earlier, later, _chained(earlier.visit_from_keyframe[-1], last, new)
+
+
+@lru_cache(maxsize=_LOCAL_MAPS)
+def _local_map_of(visit: Visit) -> LocalMap:
+    return LocalMap.of(visit.seen, visit.config, sigma_m=visit.config.covariance.sigma_submap_m)
 
 
 class Visits(Mapping[int, Visit]):

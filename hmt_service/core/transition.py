@@ -6,7 +6,7 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,7 +17,9 @@ from hmt_service.core.geometry import (
     PLANAR_AXES,
     FloatArray,
     GaussianPose,
+    certain,
     exp,
+    identity,
     inverse,
     log,
 )
@@ -38,6 +40,8 @@ class Successor:
     """A known area, or None for a new one."""
     area_from_visit: GaussianPose | None
     """Alignment with that area; None for a new one."""
+    overlap: float
+    """Share of what the visit saw that the area explains, in [0, 1]; 0 for a new one."""
     log_factor: float
     """Log of the probability of entering here times that of the observations, up to a constant."""
 
@@ -68,6 +72,7 @@ class Transition:
             rng: Source of the samples of the prior.
         """
         self._config = config.transition
+        self._refinement = config.refinement
         self._gate_sigma = config.alignment.gate_sigma
         self._axes = PLANAR_AXES if config.sensor.is_planar else np.arange(6)
         self._aligner = aligner
@@ -88,18 +93,65 @@ class Transition:
         Returns:
             A new area first, then each mode of each known area.
         """
-        candidates = self._candidates(hypothesis, visit, arc, visits)
+        candidates = self._candidates(hypothesis, visit, arc.visit_a, arc.a_from_b, visits)
         outside = self._mass_outside(candidates, visit, visits)
-        result = [Successor(None, None, float(np.log(outside)))]
-        for candidate in candidates:
-            target = visits[candidate.area]
-            for mode in self._aligner.modes(visit, target, candidate.area_from_visit):
-                log_factor = self._log_factor(visit, target, candidate.area_from_visit, mode)
-                result.append(Successor(candidate.area, mode.target_from_visit, log_factor))
-        return tuple(result)
+        new = Successor(None, None, 0.0, float(np.log(outside)))
+        return (new, *self._matches(visit, candidates, visits))
+
+    def recognitions(
+        self, hypothesis: Hypothesis, visit: Visit, visits: Visits
+    ) -> tuple[Successor, ...]:
+        """Return where else what a finished visit to a new area has seen may be in the map.
+
+        Its beginning told nothing; now all of it is known, what was seen through doors included.
+        Places that are known so well that refinement will tie them are not asked about.
+
+        Args:
+            hypothesis: What is believed, the visit included.
+            visit: The visit.
+            visits: All visits up to and including it.
+        """
+        if hypothesis.current.area_from_visit is not None:
+            return ()
+        here = certain(identity())
+        candidates = self._candidates(
+            hypothesis, visit, visit.visit, here, visits, is_asked=self._is_in_doubt
+        )
+        return self._matches(visit, candidates, visits)
+
+    def _is_in_doubt(self, prior: GaussianPose) -> bool:
+        known = self._refinement
+        return prior.sigma_m > known.max_sigma_m or prior.sigma_rad > known.max_sigma_rad
+
+    def _matches(
+        self,
+        visit: Visit,
+        candidates: Sequence[_Candidate],
+        visits: Visits,
+    ) -> tuple[Successor, ...]:
+        """Return each mode of each candidate, with the probability of what the visit saw there."""
+        return tuple(
+            Successor(
+                candidate.area,
+                mode.target_from_visit,
+                mode.overlap,
+                self._log_factor(visit, visits[candidate.area], candidate.area_from_visit, mode),
+            )
+            for candidate in candidates
+            for mode in self._aligner.modes(
+                visit, visits[candidate.area], candidate.area_from_visit
+            )
+        )
 
     def _candidates(
-        self, hypothesis: Hypothesis, visit: Visit, arc: Factor, visits: Visits
+        self,
+        hypothesis: Hypothesis,
+        visit: Visit,
+        known: int,
+        known_from_visit: GaussianPose,
+        visits: Visits,
+        *,
+        is_asked: Callable[[GaussianPose], bool] = lambda _: True,
     ) -> list[_Candidate]:
         """Return the areas whose extent the prior reaches, the nearest first."""
         most, graph = self._config.max_candidates, hypothesis.graph
@@ -107,15 +159,15 @@ class Transition:
         if not len(areas):
             return []
         extents = visits.extents(visit.visit)[areas]
-        here = graph.pose(arc.visit_a) @ arc.a_from_b.mean
+        here = graph.pose(known) @ known_from_visit.mean
         margins = self._config.margin_share * extents[:, 4]
         distances = gaps_m(visit, here, graph.poses()[areas], extents) - margins
         result = []
         # How well a place is known is asked of the nearest only: it costs more than all else here.
         for index in np.argsort(distances, kind="stable")[: _ASKED * most]:
             area, distance = int(areas[index]), float(distances[index])
-            prior = graph.relative(area, arc.visit_a) @ arc.a_from_b
-            if distance <= self._gate_sigma * prior.sigma_m:
+            prior = graph.relative(area, known) @ known_from_visit
+            if distance <= self._gate_sigma * prior.sigma_m and is_asked(prior):
                 result.append(_Candidate(area, prior, distance))
                 if len(result) == most:
                     break
