@@ -133,9 +133,9 @@ class AreaConfig(Section):
 class AlignmentConfig(Section):
     """Search for the relative poses of two submaps, and their refinement."""
 
-    raster_m: float = Field(default=0.4, gt=0.0)
+    raster_m: float = Field(default=0.2, gt=0.0)
     """Edge of a cell of the bird's-eye views that are correlated."""
-    angle_step_rad: float = Field(default=0.1, gt=0.0)
+    angle_step_rad: float = Field(default=0.05, gt=0.0)
     """Step of the rotations that are tried."""
     gate_sigma: float = Field(default=3.5, gt=0.0)
     """Size of the search region in standard deviations of the prior."""
@@ -277,7 +277,7 @@ _PRESETS: dict[Preset, dict[str, Any]] = {
             "max_correction_m": 2.0,
         },
         "areas": {"cell_size_m": 0.5},
-        "alignment": {"raster_m": 0.5},
+        "alignment": {"raster_m": 0.25},
         "observation": {"hit_sigma_m": 0.2, "angular_resolution_rad": 0.035},
     },
 }

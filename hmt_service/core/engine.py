@@ -200,7 +200,8 @@ class Engine:
         self._unweigh(opened.keyframes)
         self._refine(closed)
         stamp_s = opened.keyframes[-1].stamp_s
-        recognised = (*self._forget(stamp_s), *self._recognise(closed, stamp_s))
+        merged = self._pruned(self._particles.merge(), stamp_s, "merged")
+        recognised = (*merged, *self._forget(stamp_s), *self._recognise(closed, stamp_s))
         arc = Factor(closed.visit, opened.visit, motion)
         self._motions.append(arc)
         expanded = [
@@ -326,12 +327,14 @@ class Engine:
         }
         return (Event(EventKind.BRANCHED, stamp_s, f"{expanded} successors", numbers),)
 
-    def _pruned(self, dropped: tuple[Hypothesis, ...], stamp_s: float) -> tuple[Event, ...]:
+    def _pruned(
+        self, dropped: tuple[Hypothesis, ...], stamp_s: float, verb: str = "dropped"
+    ) -> tuple[Event, ...]:
         return tuple(
             Event(
                 EventKind.PRUNED,
                 stamp_s,
-                f"dropped hypothesis {h.hypothesis} in area {h.current.area}",
+                f"{verb} hypothesis {h.hypothesis} in area {h.current.area}",
                 {"hypothesis": float(h.hypothesis), "log_weight": h.log_weight},
             )
             for h in dropped

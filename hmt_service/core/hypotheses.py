@@ -33,6 +33,8 @@ from hmt_service.core.types import HypothesisSummary
 
 # Poses of one visit that are no farther apart are one.
 _SAME_M, _SAME_RAD = 0.6, 0.15
+# Maps that differ by no more than this anywhere are the same.
+_EQUAL_M, _EQUAL_RAD = 0.1, 0.03
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -167,6 +169,14 @@ class Hypothesis:
             topology = topology.with_visit(Assignment(visit, area, area_from_visit))
         return Hypothesis(hypothesis, log_weight, topology, graph, self.unlikely_for)
 
+    def is_same_map(self, other: Hypothesis) -> bool:
+        """Return whether the other has the same areas, and all visits where this one has them."""
+        if self.topology.areas != other.topology.areas:
+            return False
+        own, theirs = self.graph.poses(), other.graph.poses()
+        apart = np.abs(own - theirs).max(axis=0)
+        return bool(apart[:3, 3].max() <= _EQUAL_M and apart[:3, :3].max() <= _EQUAL_RAD)
+
     def has_recognised(self, other: Hypothesis, area: int, area_from_visit: Pose) -> bool:
         """Return whether this is another hypothesis but that it ties the last visit there."""
         visit = self.current.visit
@@ -241,6 +251,28 @@ class ParticleLayer:
         return self.replace(
             [replace(h, log_weight=h.log_weight + log_likelihood(h)) for h in self._hypotheses]
         )
+
+    def merge(self) -> tuple[Hypothesis, ...]:
+        """Keep one of hypotheses that differ only in the name of a place, with the mass of all.
+
+        A visit on the border of two areas may be said to be to either. Where all areas and all
+        poses are the same, that is no difference in the world.
+
+        Returns:
+            The hypotheses that are no longer there.
+        """
+        kept: list[Hypothesis] = []
+        merged: list[Hypothesis] = []
+        for hypothesis in self._hypotheses:
+            index = next((i for i, h in enumerate(kept) if h.is_same_map(hypothesis)), None)
+            if index is None:
+                kept.append(hypothesis)
+                continue
+            mass = np.logaddexp(kept[index].log_weight, hypothesis.log_weight)
+            kept[index] = replace(kept[index], log_weight=float(mass))
+            merged.append(hypothesis)
+        self.replace(kept)
+        return tuple(merged)
 
     def forget(self, *, unlikely_mass: float, patience: int) -> tuple[Hypothesis, ...]:
         """Drop what has been unlikely for long; to be called once per area entered.

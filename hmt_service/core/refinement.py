@@ -11,8 +11,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
-
 from hmt_service.core.alignment import Aligner, Mode
 from hmt_service.core.config import Config
 from hmt_service.core.geometry import GaussianPose
@@ -48,7 +46,7 @@ class Refinement:
         assignment = hypothesis.topology.assignments[visit.visit]
         founder = assignment.area
         ties: list[tuple[int, Mode]] = []
-        for other in self._neighbours(hypothesis, visit, visits, founder):
+        for other in self._neighbours(hypothesis, visit, visits):
             prior = hypothesis.graph.relative(other, visit.visit)
             if not self._is_certain(prior):
                 continue
@@ -71,17 +69,25 @@ class Refinement:
         topology = hypothesis.topology.with_visit(assignment)
         return replace(hypothesis, graph=graph, topology=topology)
 
-    def _neighbours(
-        self, hypothesis: Hypothesis, visit: Visit, visits: Visits, founder: int
-    ) -> list[int]:
-        """Return the visits near enough to overlap, the founder of the visit's area first."""
+    def _neighbours(self, hypothesis: Hypothesis, visit: Visit, visits: Visits) -> list[int]:
+        """Return the founders of the areas near enough to overlap, that of the visit's own first.
+
+        Only founders: ties of every visit to every other in the same place would make the cost of
+        a visit grow with their number.
+        """
         # The visit just before is tied by the motion, from the same observations.
-        others = max(visit.visit - 1, 0)
-        poses = hypothesis.graph.poses()
-        gaps = gaps_m(visit, poses[visit.visit], poses[:others], visits.extents(others))
-        near = np.flatnonzero(gaps <= self._config.max_gap_m)
-        ordered = sorted((int(v) != founder, float(gaps[v]), int(v)) for v in near)
-        return [other for _, _, other in ordered[: self._config.max_neighbours]]
+        areas = [area for area in hypothesis.topology.areas if area < visit.visit - 1]
+        if not areas:
+            return []
+        poses, extents = hypothesis.graph.poses(), visits.extents(visit.visit)
+        gaps = gaps_m(visit, poses[visit.visit], poses[areas], extents[areas])
+        own = hypothesis.topology.assignments[visit.visit].area
+        near = [
+            (area != own, float(gap), area)
+            for area, gap in zip(areas, gaps, strict=True)
+            if gap <= self._config.max_gap_m
+        ]
+        return [area for _, _, area in sorted(near)[: self._config.max_neighbours]]
 
     def _is_certain(self, prior: GaussianPose) -> bool:
         config = self._config
