@@ -27,14 +27,14 @@ from hmt_service.core.plausibility import Plausibility
 from hmt_service.core.refinement import Refinement
 from hmt_service.core.smoothing import Smoother
 from hmt_service.core.stored import (
+    ScanLog,
     StoredAssignment,
     StoredFactor,
     StoredHypothesis,
     StoredMap,
-    StoredScan,
     StoredVisit,
 )
-from hmt_service.core.submap import Visit, Visits, as_points, visit_of
+from hmt_service.core.submap import Visit, as_points, visit_of
 from hmt_service.core.transition import Successor, Transition
 from hmt_service.core.types import (
     ArcResidual,
@@ -54,6 +54,7 @@ from hmt_service.core.types import (
     Tracking,
     TrackingFailure,
 )
+from hmt_service.core.visits import Visits, share_new
 from hmt_service.errors import NotFound, Unavailable
 
 
@@ -83,7 +84,7 @@ class Engine:
         )
         self._visits = Visits()
         self._motions: list[Factor] = []
-        self._scans: list[StoredScan] = []
+        self._scans = ScanLog()
         self._tracked: Counter[str] = Counter()
         self._weighed: dict[int, dict[int, float]] = {}
         self._next_hypothesis = 0
@@ -103,7 +104,7 @@ class Engine:
             What was decided because of it.
         """
         pose = tracking.keyframe_from_body.mean
-        self._scans.append(StoredScan(tracking.stamp_s, tracking.keyframe_index, pose))
+        self._scans.append(tracking.stamp_s, tracking.keyframe_index, pose)
         self._tracked.update(_said_of(tracking))
         keyframe = tracking.keyframe
         if keyframe is None:
@@ -210,6 +211,7 @@ class Engine:
             for successor in self._expand(hypothesis, opened, arc)
         ]
         self._visits.put(opened)
+        self._forget_scans(closed)
         pruned = self._pruned(self._particles.replace(expanded), stamp_s)
         branched = self._branched(len(expanded), stamp_s)
         return (*recognised, self._entered(stamp_s), *branched, *pruned)
@@ -290,6 +292,23 @@ class Engine:
         taken_back = [self._weighed.get(keyframe.index, {}) for keyframe in keyframes]
         self._weighed.clear()
         self._particles.reweight(lambda h: -sum(said.get(h.hypothesis, 0.0) for said in taken_back))
+
+    def _forget_scans(self, visit: Visit) -> None:
+        """Keep the path only of a visit that shows nothing new of an area that is well known.
+
+        All hypotheses must agree that it did not found one: what founders saw is compared with.
+        """
+        best, most = self._particles.best.topology, self._config.areas.max_views
+        if any(visit.visit in h.topology.areas for h in self._particles.hypotheses):
+            return
+        to_same = best.visits_to[best.assignments[visit.visit].area]
+        others = [v for v in to_same if v != visit.visit and not self._visits.is_forgotten(v)]
+        if len(others) < most:
+            return
+        poses = dict(enumerate(self._particles.best.graph.poses()))
+        new = share_new(visit, [self._visits[v] for v in others], poses)
+        if new <= self._config.areas.max_new_share:
+            self._visits.forget(visit.visit)
 
     def _refine(self, visit: Visit) -> None:
         """Let every hypothesis use all of a visit that is over, not only its beginning."""

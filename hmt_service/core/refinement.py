@@ -16,7 +16,8 @@ from hmt_service.core.config import Config
 from hmt_service.core.geometry import GaussianPose
 from hmt_service.core.graph import Factor
 from hmt_service.core.hypotheses import Hypothesis
-from hmt_service.core.submap import Visit, Visits, gaps_m
+from hmt_service.core.submap import Visit
+from hmt_service.core.visits import Visits, gaps_m
 
 # chi-square 99.9 % for 6 degrees of freedom: a match beyond it contradicts the graph.
 _GATE = 22.46

@@ -15,6 +15,7 @@ from collections.abc import Mapping, Sequence
 from itertools import pairwise
 
 import numpy as np
+import numpy.typing as npt
 from scipy.spatial import KDTree
 
 from hmt_service.core.config import Config
@@ -88,30 +89,28 @@ class Smoother:
     def _ties(self, keyframes: Sequence[Keyframe], poses: FloatArray) -> list[Factor]:
         """Return what each keyframe says of its pose among those of other times."""
         seen = [self._seen(keyframe) for keyframe in keyframes]
-        views = np.array(
-            [
-                transform_points(pose, each.points.mean(axis=0)[None])[0]
-                for pose, each in zip(poses, seen, strict=True)
-            ]
-        )
-        tree = KDTree(views)
+        # Of forgotten keyframes nothing is left to be compared.
+        kept = np.array([index for index, each in enumerate(seen) if len(each.points)])
+        views = np.full((len(keyframes), 3), np.inf)
+        for index in kept:
+            views[index] = transform_points(poses[index], seen[index].points.mean(axis=0)[None])
+        tree = KDTree(views[kept])
         windows: dict[int, LocalMap] = {}
         ties = []
-        for index, keyframe in enumerate(keyframes):
-            sweep = self._sweep(seen[index], keyframe)
-            for other in self._other_times(
-                index, tree.query_ball_point(views[index], _NEAR_M), views
-            ):
+        for index in kept:
+            sweep = self._sweep(seen[index], keyframes[index])
+            near = kept[tree.query_ball_point(views[index], _NEAR_M)]
+            for other in self._other_times(index, near, views):
                 if other not in windows:
                     windows[other] = self._window(other, seen, poses)
                 tie = self._tie(windows[other], sweep, inverse(poses[other]) @ poses[index])
                 if tie is not None:
-                    ties.append(Factor(other, index, tie))
+                    ties.append(Factor(other, int(index), tie))
         return ties
 
-    def _other_times(self, index: int, near: Sequence[int], views: FloatArray) -> list[int]:
+    def _other_times(self, index: int, near: npt.NDArray[np.intp], views: FloatArray) -> list[int]:
         """Return the keyframe with the nearest view of each earlier time, the nearest first."""
-        earlier = np.sort([other for other in near if other < index - self._gap])
+        earlier = np.sort(near[near < index - self._gap])
         if not len(earlier):
             return []
         times = np.split(earlier, np.flatnonzero(np.diff(earlier) > self._gap) + 1)

@@ -8,8 +8,11 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from array import array
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+
+import numpy as np
 
 from hmt_service.core.geometry import GaussianPose, Pose
 from hmt_service.core.types import Keyframe
@@ -77,6 +80,28 @@ class StoredScan:
     """Keyframe that the pose is relative to."""
     keyframe_from_body: Pose
     """Pose of the scan relative to that keyframe, shape (4, 4)."""
+
+
+class ScanLog:
+    """Scans as they come, 112 bytes each."""
+
+    def __init__(self) -> None:
+        """Start empty."""
+        self._stamps_s = array("d")
+        self._keyframes = array("q")
+        self._poses = array("d")
+
+    def append(self, stamp_s: float, keyframe_index: int, keyframe_from_body: Pose) -> None:
+        """Add the next scan."""
+        self._stamps_s.append(stamp_s)
+        self._keyframes.append(keyframe_index)
+        self._poses.extend(keyframe_from_body[:3].ravel())
+
+    def __iter__(self) -> Iterator[StoredScan]:
+        """Iterate over the scans in the order that they came."""
+        poses = np.tile(np.eye(4), (len(self._stamps_s), 1, 1))
+        poses[:, :3] = np.array(self._poses).reshape(-1, 3, 4)
+        return map(StoredScan, self._stamps_s, self._keyframes, poses)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -10,7 +10,7 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import pairwise
@@ -187,61 +187,6 @@ class Visit:
 @lru_cache(maxsize=_LOCAL_MAPS)
 def _local_map_of(visit: Visit) -> LocalMap:
     return LocalMap.of(visit.seen, visit.config, sigma_m=visit.config.covariance.sigma_submap_m)
-
-
-class Visits(Mapping[int, Visit]):
-    """All visits by their numbers, in time order, and where each lies in its own frame."""
-
-    def __init__(self, visits: Iterable[Visit] = ()) -> None:
-        """Take some visits, numbered from 0."""
-        self._visits: list[Visit] = []
-        self._extents = np.zeros((0, 5))
-        for visit in visits:
-            self.put(visit)
-
-    def __getitem__(self, visit: int) -> Visit:
-        """Return one visit."""
-        return self._visits[visit]
-
-    def __iter__(self) -> Iterator[int]:
-        """Iterate over the numbers."""
-        return iter(range(len(self._visits)))
-
-    def __len__(self) -> int:
-        """Return the number of visits."""
-        return len(self._visits)
-
-    def put(self, visit: Visit) -> None:
-        """Add the next visit, or replace one that has become longer or shorter."""
-        if visit.visit == len(self._visits):
-            self._visits.append(visit)
-        else:
-            self._visits[visit.visit] = visit
-            self._extents = self._extents[: visit.visit]
-
-    def extents(self, count: int) -> FloatArray:
-        """Return centre, radius and reach of the first so many visits, shape (count, 5), m."""
-        new = [
-            [*visit.centre, visit.radius_m, visit.reach_m]
-            for visit in self._visits[len(self._extents) : count]
-        ]
-        if new:
-            self._extents = np.concatenate([self._extents, new])
-        return self._extents[:count]
-
-
-def gaps_m(visit: Visit, here: Pose, poses: FloatArray, extents: FloatArray) -> FloatArray:
-    """Return how far keyframes of a visit are from those of others at least, shape (N,), m.
-
-    Args:
-        visit: The visit.
-        here: Its pose.
-        poses: Those of the others, in the same frame, shape (N, 4, 4).
-        extents: Those of the others, shape (N, 5).
-    """
-    centres = np.einsum("nij,nj->ni", poses[:, :3, :3], extents[:, :3]) + poses[:, :3, 3]
-    offsets = centres - transform_points(here, visit.centre[None])
-    return np.asarray(np.linalg.norm(offsets, axis=1) - extents[:, 3] - visit.radius_m)
 
 
 def _chained(visit_from_last: GaussianPose, last: Keyframe, new: Keyframe) -> GaussianPose:

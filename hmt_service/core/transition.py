@@ -26,7 +26,8 @@ from hmt_service.core.geometry import (
 from hmt_service.core.graph import Factor
 from hmt_service.core.hypotheses import Hypothesis
 from hmt_service.core.observation import ObservationModel
-from hmt_service.core.submap import Visit, Visits, gaps_m
+from hmt_service.core.submap import Visit
+from hmt_service.core.visits import Visits, gaps_m
 
 # So many times as many areas are looked at as may be candidates.
 _ASKED = 4

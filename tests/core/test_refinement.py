@@ -11,7 +11,8 @@ from hmt_service.core.geometry import Pose, identity, inverse, log, planar_pose
 from hmt_service.core.graph import Factor, PoseGraph
 from hmt_service.core.hypotheses import Assignment, Hypothesis, Topology
 from hmt_service.core.refinement import Refinement
-from hmt_service.core.submap import Visit, Visits
+from hmt_service.core.submap import Visit
+from hmt_service.core.visits import Visits
 from tests.core.factories import ROOM, SQUARE, box, gaussian, line, visit_along
 
 FAR = np.concatenate([box(40.0, -2.0, 48.0, 2.0), box(42.0, -1.0, 43.0, 1.0)])

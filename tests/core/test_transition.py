@@ -14,8 +14,9 @@ from hmt_service.core.geometry import GaussianPose, Pose, identity, inverse, log
 from hmt_service.core.graph import Factor, PoseGraph
 from hmt_service.core.hypotheses import Assignment, Hypothesis, Topology
 from hmt_service.core.observation import ObservationModel
-from hmt_service.core.submap import Visit, Visits
+from hmt_service.core.submap import Visit
 from hmt_service.core.transition import Successor, Transition
+from hmt_service.core.visits import Visits
 from tests.core.factories import ROOM, Walls, box, gaussian, line, visit_along
 
 CONFIG = load_config()
