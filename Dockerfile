@@ -15,7 +15,7 @@ RUN useradd --create-home --uid 1000 hmt \
     && install --directory --owner hmt --group hmt /data
 USER hmt
 # As the user who runs it: compiled code is looked for where that user may write.
-RUN cd / && python -c 'from hmt_service.core import local_map; local_map.compile_all_kernels()'
+RUN cd / && python -c 'from hmt_service.core import kernels; kernels.compile_all()'
 # Maps and recordings: mount a volume here.
 WORKDIR /data
 VOLUME /data

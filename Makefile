@@ -13,7 +13,7 @@ $(INSTALLED): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python >= 3.11 is needed")'
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install -c constraints.txt -e '.[dev]'
-	$(BIN)/python -c 'from hmt_service.core import local_map; local_map.compile_all_kernels()'
+	$(BIN)/python -c 'from hmt_service.core import kernels; kernels.compile_all()'
 	touch $@
 
 demo: $(INSTALLED)

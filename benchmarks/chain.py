@@ -125,7 +125,7 @@ def read_readings(path: Path) -> Iterator[Reading]:
 def _map(readings: Iterable[Reading], result: Path, preset: Preset) -> None:
     """Map in this process, and leave what it did and cost in a file."""
     process, clock = psutil.Process(), StageClock(now_s=time.process_time)
-    empty_bytes = process.memory_info().rss
+    empty_bytes: list[float] = []
     memory_bytes: list[float] = []
     spent_s = []
 
@@ -133,8 +133,13 @@ def _map(readings: Iterable[Reading], result: Path, preset: Preset) -> None:
         memory_bytes.append(float(process.memory_info().rss))
         spent_s.append(list(clock.spent_s.values()))
 
+    def measured() -> Iterator[Reading]:
+        # Asked for the first time when all code is loaded, and there is no map yet.
+        empty_bytes.append(float(process.memory_info().rss))
+        yield from readings
+
     with clock.running():
-        engine, cost = map_readings(readings, load_config(preset), on_scan=remember)
+        engine, cost = map_readings(measured(), load_config(preset), on_scan=remember)
     spent_s.append(list(clock.spent_s.values()))
     trajectory, snapshot = engine.trajectory(), engine.snapshot()
     best = None if snapshot is None else snapshot.posterior.hypotheses[0]
@@ -142,7 +147,7 @@ def _map(readings: Iterable[Reading], result: Path, preset: Preset) -> None:
         result,
         busy_s=cost.busy_s,
         spent_s=np.array(spent_s),
-        empty_bytes=empty_bytes,
+        empty_bytes=empty_bytes[0],
         memory_bytes=np.array(memory_bytes),
         stamps_s=np.array([pose.stamp_s for pose in trajectory]),
         poses=np.array([pose.reference_from_body for pose in trajectory]),

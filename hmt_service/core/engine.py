@@ -22,6 +22,7 @@ from hmt_service.core.config import Config
 from hmt_service.core.geometry import FloatArray, GaussianPose, Pose, inverse, log
 from hmt_service.core.graph import Factor, PoseGraph
 from hmt_service.core.hypotheses import Assignment, Hypothesis, ParticleLayer, Topology
+from hmt_service.core.kernels import compile_kernels
 from hmt_service.core.observation import ObservationModel
 from hmt_service.core.plausibility import Plausibility
 from hmt_service.core.refinement import Refinement
@@ -68,6 +69,7 @@ class Engine:
             config: Settings of all stages.
             seed: Seed of all randomness.
         """
+        compile_kernels(config)
         self._config = config
         self._seed = seed
         rng = np.random.default_rng(seed)

@@ -375,9 +375,4 @@ def compile_kernels(*, is_planar: bool) -> None:
     lags = np.zeros(50) if is_planar else np.linspace(1.0, 0.0, 50)
     sweep = Sweep(points, lags, sensor - points)
     local_map.register(sweep.thinned(0.1, 40), wide, wide)
-
-
-def compile_all_kernels() -> None:
-    """Compile what any registration needs: after installation, so that no robot waits for it."""
-    for is_planar in (True, False):
-        compile_kernels(is_planar=is_planar)
+    local_map.glance(sweep, identity(), np.eye(6))

@@ -83,13 +83,13 @@ class StoredScan:
 
 
 class ScanLog:
-    """Scans as they come, 112 bytes each."""
+    """Scans as they come, 64 bytes each: how far they are from keyframes, in single precision."""
 
     def __init__(self) -> None:
         """Start empty."""
         self._stamps_s = array("d")
         self._keyframes = array("q")
-        self._poses = array("d")
+        self._poses = array("f")
 
     def append(self, stamp_s: float, keyframe_index: int, keyframe_from_body: Pose) -> None:
         """Add the next scan."""

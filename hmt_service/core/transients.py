@@ -19,7 +19,7 @@ import numpy.typing as npt
 from numba import njit
 
 from hmt_service.core.config import Config
-from hmt_service.core.geometry import FloatArray, Pose, transform_points
+from hmt_service.core.geometry import FloatArray, Pose, certain, identity, transform_points
 from hmt_service.core.types import Keyframe
 
 # A keyframe is compared with so many before it and as many after it, which bounds the cost.
@@ -74,6 +74,13 @@ def without_transients(
     )
     stays = np.split(majorities < _MIN_MAJORITY, starts[1:-1])
     return [cloud[stay] for cloud, stay in zip(clouds, stays, strict=True)]
+
+
+def compile_kernels(config: Config) -> None:
+    """Compile what the votes need, or load it: not while the first area is left."""
+    points = np.random.default_rng(0).uniform(1.0, 2.0, (10, 3)).astype(np.float32)
+    seen = Keyframe(0, 0.0, points, np.zeros(3), certain(identity()))
+    without_transients([seen, seen], [identity()] * 2, config)
 
 
 def _sensor_at(frame_from_body: Pose, keyframe: Keyframe) -> Pose:
