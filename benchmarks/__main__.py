@@ -53,6 +53,7 @@ class Name(StrEnum):
     TABLE2 = "table2"
     PEERS = "peers"
     SCALING = "scaling"
+    LAPS = "laps"
     LATENCY = "latency"
 
 

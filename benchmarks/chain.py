@@ -22,7 +22,7 @@ from benchmarks.processes import MemorySample, run_child
 from benchmarks.stages import StageClock
 from hmt_service.core.config import Preset, load_config
 from hmt_service.core.geometry import FloatArray
-from hmt_service.core.types import OdometryReading, Reading, Scan, StampedPose
+from hmt_service.core.types import Event, EventKind, OdometryReading, Reading, Scan, StampedPose
 from hmt_service.runtime.offline import map_readings
 
 _ROOT = Path(__file__).parents[1]
@@ -43,6 +43,8 @@ class ChainRun:
     """Resident memory after each scan, shape (scans,)."""
     trajectory: tuple[StampedPose, ...]
     """Globally consistent poses of the scans."""
+    areas: FloatArray
+    """Different areas entered up to each scan, shape (scans,)."""
     loop_closures: int
     """How many visits of the best hypothesis are to areas known before."""
     samples: tuple[MemorySample, ...]
@@ -101,6 +103,7 @@ def run_chain(
             empty_bytes=float(arrays["empty_bytes"]),
             memory_bytes=arrays["memory_bytes"],
             trajectory=trajectory,
+            areas=arrays["areas"],
             loop_closures=int(arrays["loop_closures"]),
             samples=child.samples,
         )
@@ -129,7 +132,15 @@ def _map(readings: Iterable[Reading], result: Path, preset: Preset) -> None:
     memory_bytes: list[float] = []
     spent_s = []
 
+    entered: set[float] = set()
+    areas: list[int] = []
+
+    def enter(event: Event) -> None:
+        if event.kind is EventKind.AREA_ENTERED:
+            entered.add(event.numbers["area"])
+
     def remember() -> None:
+        areas.append(len(entered))
         memory_bytes.append(float(process.memory_info().rss))
         spent_s.append(list(clock.spent_s.values()))
 
@@ -139,7 +150,9 @@ def _map(readings: Iterable[Reading], result: Path, preset: Preset) -> None:
         yield from readings
 
     with clock.running():
-        engine, cost = map_readings(measured(), load_config(preset), on_scan=remember)
+        engine, cost = map_readings(
+            measured(), load_config(preset), on_scan=remember, on_event=enter
+        )
     spent_s.append(list(clock.spent_s.values()))
     trajectory, snapshot = engine.trajectory(), engine.snapshot()
     best = None if snapshot is None else snapshot.posterior.hypotheses[0]
@@ -149,6 +162,7 @@ def _map(readings: Iterable[Reading], result: Path, preset: Preset) -> None:
         spent_s=np.array(spent_s),
         empty_bytes=empty_bytes[0],
         memory_bytes=np.array(memory_bytes),
+        areas=np.array(areas),
         stamps_s=np.array([pose.stamp_s for pose in trajectory]),
         poses=np.array([pose.reference_from_body for pose in trajectory]),
         loop_closures=0 if best is None else best.loop_closures,

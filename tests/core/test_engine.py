@@ -23,6 +23,7 @@ from hmt_service.core.types import (
     TrackingFailure,
 )
 from hmt_service.errors import NotFound, Unavailable
+from hmt_service.io.map_file import read_map, write_map
 from hmt_service.io.trajectory import write_tum
 from tests.core.factories import (
     RING,
@@ -118,6 +119,38 @@ def processed(
         assert snapshot is not None
         snapshots.append(snapshot)
     return engine, snapshots
+
+
+def test_what_shows_nothing_new_of_a_known_area_is_not_kept(tmp_path: Path) -> None:
+    config = load_config(text="areas: {max_cut: 0.55, max_views: 1, max_new_share: 0.4}")
+    path = ring_path(laps=3.5)
+    wheels = drifting(path, scale=1.03, turn_rad_per_m=0.01)
+    odometry, engine = Odometry(config), Engine(config, seed=0)
+    for reading in drive(RING, path, odometry=wheels, noise=np.random.default_rng(1)):
+        tracking = odometry.process(reading)
+        if tracking is not None:
+            engine.process(tracking)
+    engine.finish()
+    stored = engine.stored()
+    forgotten = [k.index for k in stored.keyframes if not len(k.points_in_body)]
+    assert 0.2 < len(forgotten) / len(stored.keyframes) < 0.7
+    # What founded an area is kept whole, and so is the path of everything else.
+    founders = {a.visit for a in stored.hypotheses[0].assignments if a.area_from_visit is None}
+    kept = [v for v in stored.visits if v.visit in founders]
+    assert not any(
+        v.first_keyframe <= index <= v.last_keyframe for v in kept for index in forgotten
+    )
+    first = inverse(path[0])
+    errors_m = [
+        np.linalg.norm((first @ truth)[:3, 3] - found.reference_from_body[:3, 3])
+        for truth, found in zip(path, engine.trajectory(), strict=True)
+    ]
+    assert max(errors_m) < 0.15
+    write_map(tmp_path / "map.hmt", stored)
+    again = read_map(tmp_path / "map.hmt")
+    assert [len(k.points_in_body) for k in again.keyframes] == [
+        len(k.points_in_body) for k in stored.keyframes
+    ]
 
 
 def position_errors_m(engine: Engine) -> list[float]:

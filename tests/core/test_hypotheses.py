@@ -205,3 +205,69 @@ def test_staying_in_an_area_does_not_lengthen_the_topological_path() -> None:
     )
     assert stayed.topology.path == (0, 1, 0)
     assert stayed.topology.visits_to[0] == (0, 2, 3)
+
+
+def with_place(hypothesis: Hypothesis, area: int, x_m: float, *, identifier: int) -> Hypothesis:
+    """Return the same but that the last visit was to an area, `x_m` from its founder."""
+    place = gaussian(planar_pose(x_m, 0.0, 0.0), sigma_m=0.001, sigma_rad=0.001)
+    graph = hypothesis.graph.copy()
+    graph.add_factor(Factor(area, hypothesis.current.visit, place))
+    topology = hypothesis.topology.with_visit(Assignment(hypothesis.current.visit, area, place))
+    return replace(hypothesis, hypothesis=identifier, topology=topology, graph=graph)
+
+
+def test_two_names_of_one_place_are_one_hypothesis() -> None:
+    base = travelled()
+    first = with_place(base, 0, 0.4, identifier=10)
+    other_name = Assignment(2, 1, first.graph.relative(1, 2))
+    second = replace(first, hypothesis=11, topology=base.topology.with_visit(other_name))
+    elsewhere = with_place(base, 0, 1.4, identifier=12)
+    layer = ParticleLayer(budget=9, negligible_mass=1e-9, rng=np.random.default_rng(0))
+    layer.replace(
+        [
+            replace(hypothesis, log_weight=math.log(weight))
+            for hypothesis, weight in ((first, 0.5), (second, 0.3), (elsewhere, 0.2))
+        ]
+    )
+    assert [h.hypothesis for h in layer.merge()] == [11]
+    assert [h.hypothesis for h in layer.hypotheses] == [10, 12]
+    assert layer.probabilities == pytest.approx([0.8, 0.2])
+
+
+def test_a_new_area_where_a_known_one_is_stays_another_hypothesis() -> None:
+    base = travelled()
+    known = with_place(base, 0, 0.4, identifier=10)
+    new = replace(known, hypothesis=11, topology=base.topology.with_visit(Assignment(2, 2, None)))
+    layer = ParticleLayer(budget=9, negligible_mass=1e-9, rng=np.random.default_rng(0))
+    layer.replace([known, new])
+    assert layer.merge() == ()
+    assert len(layer.hypotheses) == 2
+
+
+def test_what_stays_unlikely_is_forgotten_and_what_recovers_is_not() -> None:
+    layer = layer_of(0.9, 0.0999, 1e-4)
+    for _ in range(3):
+        assert layer.forget(unlikely_mass=1e-3, patience=3) == ()
+    # It becomes likely once: the count begins again.
+    layer.reweight(lambda h: 6.0 if h.hypothesis == 2 else 0.0)
+    assert layer.forget(unlikely_mass=1e-3, patience=3) == ()
+    layer.reweight(lambda h: -6.0 if h.hypothesis == 2 else 0.0)
+    for _ in range(3):
+        assert layer.forget(unlikely_mass=1e-3, patience=3) == ()
+    assert [h.hypothesis for h in layer.forget(unlikely_mass=1e-3, patience=3)] == [2]
+    assert layer.probabilities == pytest.approx([0.9, 0.1], abs=1e-3)
+
+
+@pytest.mark.parametrize("is_same_area", [False, True])
+def test_recognised_visit_is_tied_and_may_keep_its_area(is_same_area: bool) -> None:
+    arc = Factor(2, 3, gaussian(planar_pose(5.0, 0.0, 0.0), sigma_m=1.0))
+    new = travelled().extended(Assignment(3, 3, None), arc, hypothesis=3, log_weight=0.0)
+    place = gaussian(planar_pose(0.7, 0.0, 0.0), sigma_m=0.01)
+    known = new.recognising(1, place, is_same_area=is_same_area, hypothesis=4, log_weight=-1.0)
+    assert known.topology.areas == ((0, 1) if is_same_area else (0, 1, 3))
+    assert known.graph.relative(1, 3).mean[0, 3] == pytest.approx(0.7, abs=0.01)
+    assert new.graph.relative(1, 3).mean[0, 3] != pytest.approx(0.7, abs=0.05)
+    # Nobody need be told the same again.
+    assert known.has_recognised(new, 1, place.mean)
+    assert not new.has_recognised(new, 1, place.mean)
+    assert not known.has_recognised(new, 1, planar_pose(2.7, 0.0, 0.0))

@@ -168,3 +168,36 @@ def test_same_seed_gives_the_same_factors() -> None:
     ]
     assert runs[0] == runs[1]
     assert runs[0][0] != runs[2][0]
+
+
+def recognitions_of(sigma_m: float, path: Sequence[Pose]) -> tuple[Successor, ...]:
+    """Return what a finished visit along `path`, to a new area, is recognised as."""
+    hypothesis, visits = explored(IN_ROOM, IN_OTHER)
+    observation = ObservationModel(CONFIG.observation, CONFIG.sensor)
+    visit = visit_along(WORLD, path, visit=2)
+    for known in [*visits.values(), visit]:
+        for keyframe in known.keyframes:
+            observation.learn(keyframe)
+    back = inverse(IN_OTHER[0]) @ path[0] @ planar_pose(0.4, 0.3, 0.02)
+    arc = Factor(1, 2, gaussian(back, sigma_m=sigma_m, sigma_rad=0.02))
+    hypothesis = hypothesis.extended(Assignment(2, 2, None), arc, hypothesis=1, log_weight=0.0)
+    transition = Transition(CONFIG, Aligner(CONFIG), observation, np.random.default_rng(0))
+    return transition.recognitions(hypothesis, visit, Visits([*visits.values(), visit]))
+
+
+def test_finished_visit_is_recognised_where_its_place_is_in_doubt() -> None:
+    path = line(planar_pose(0.5, -0.5, 1.0), length_m=1.0)
+    (match,) = recognitions_of(1.5, path)
+    truth = inverse(IN_ROOM[0]) @ path[0]
+    assert match.area == 0
+    assert match.area_from_visit is not None
+    assert match.area_from_visit.mean == pytest.approx(truth, abs=0.02)
+    assert match.overlap > 0.9
+    # Of what is expected almost anywhere, being here tells less.
+    (less,) = recognitions_of(3.0, path)
+    assert less.log_factor < match.log_factor - 0.5
+
+
+def test_finished_visit_whose_place_is_known_is_left_to_refinement() -> None:
+    path = line(planar_pose(0.5, -0.5, 1.0), length_m=1.0)
+    assert recognitions_of(0.05, path) == ()
