@@ -36,6 +36,7 @@ from hmt_service.core.types import (
     Tracking,
     TrackingFailure,
 )
+from hmt_service.core.wheels import WheelCalibration
 from hmt_service.errors import InvalidInput
 
 # Of a heading that may be anything, and of a position that nothing but speed bounds.
@@ -81,6 +82,8 @@ class Odometry:
         self._last_stamp_s: float | None = None
         self._odometry: OdometryReading | None = None
         self._odometry_at_scan: OdometryReading | None = None
+        self._odometry_at_keyframe: OdometryReading | None = None
+        self._wheels = WheelCalibration(config.motion)
         self._motion_since_odometry = identity()
         self._last_elapsed_s = 0.0
         self._intervals_s: deque[float] = deque(maxlen=_INTERVALS)
@@ -103,7 +106,7 @@ class Odometry:
         if isinstance(reading, OdometryReading):
             if self._has_jumped(reading):
                 # Its frame has moved, not the robot: nothing before compares with what follows.
-                self._odometry_at_scan = None
+                self._odometry_at_scan = self._odometry_at_keyframe = None
             self._odometry = reading
             return None
         return self._track(reading)
@@ -133,7 +136,10 @@ class Odometry:
         self._remember_motion(posed.mean, elapsed_s, sweep_motion)
         self._failures = 0 if failure is None else self._failures + 1
         told, error = self._told(posed, fit if failure is None else None, uneven)
-        if self._is_keyframe(posed.mean, len(sweep.points), registration, failure):
+        is_keyframe = self._is_keyframe(posed.mean, len(sweep.points), registration, failure)
+        if is_keyframe and fit is not None and failure is None:
+            self._learn(posed.mean, fit.own_covariance + 2.0 * error)
+        if is_keyframe:
             if failure is not None and not self._has_new_odometry:
                 told = self._lost(told.mean, scan.stamp_s - self._registered_s)
             return self._add_keyframe(
@@ -162,7 +168,8 @@ class Odometry:
         """Return the motion since the last scan: by the wheels, or as it was before."""
         now, before, noise = self._odometry, self._odometry_at_scan, self._motion
         if now is not None and before is not None and now is not before:
-            measured = inverse(before.odom_from_body) @ now.odom_from_body
+            told = inverse(before.odom_from_body) @ now.odom_from_body
+            measured = self._wheels.corrected(told)
             # Scans that came without odometry have been tracked through part of it already.
             motion = inverse(self._motion_since_odometry) @ measured
             xi = log(measured)
@@ -295,6 +302,13 @@ class Odometry:
         covariance = isotropic_covariance(sigma_rad=_LOST_RAD, sigma_m=sigma_m)
         return self._confined(GaussianPose(mean, covariance))
 
+    def _learn(self, keyframe_from_body: Pose, covariance: FloatArray) -> None:
+        """Compare the step since the last keyframe with what the wheels say of it."""
+        before, now = self._odometry_at_keyframe, self._odometry
+        if before is not None and now is not None and self._has_new_odometry:
+            told = inverse(before.odom_from_body) @ now.odom_from_body
+            self._wheels.learn(told, keyframe_from_body, covariance)
+
     # ------------------------------------------------------------------ what is kept
 
     def _is_keyframe(
@@ -345,6 +359,7 @@ class Odometry:
         self._keyframes += 1
         self._keyframe_from_body = certain(identity())
         self._keyframe_error = error
+        self._odometry_at_keyframe = self._odometry
         self._failures = 0
         self._remember(scan, None)
         here = certain(identity())
