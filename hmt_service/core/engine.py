@@ -439,7 +439,7 @@ class Engine:
             PlacedArea(
                 area=area,
                 reference_from_area=poses[area],
-                keyframes=sum(len(self._visits[v].keyframes) for v in visits_to[area]),
+                keyframes=sum(self._visits.keyframes(v) for v in visits_to[area]),
                 visits=len(visits_to[area]),
                 points_in_area=self._submap(chosen, area) if with_points else _NO_POINTS,
             )
@@ -513,14 +513,15 @@ class Engine:
 
     def stored(self) -> StoredMap:
         """Return everything that a map file needs to hold."""
+        visits = tuple(self._visits.values())
         return StoredMap(
             revision=self._revision,
             seed=self._seed,
             config_json=self._config.model_dump_json(),
-            keyframes=tuple(k for visit in self._visits.values() for k in visit.keyframes),
+            keyframes=tuple(k for visit in visits for k in visit.keyframes),
             visits=tuple(
                 StoredVisit(visit.visit, visit.first_keyframe, visit.last_keyframe)
-                for visit in self._visits.values()
+                for visit in visits
             ),
             hypotheses=tuple(_stored(h) for h in self._particles.hypotheses),
             scans=tuple(self._scans),
@@ -553,6 +554,7 @@ class Engine:
         clouds = [
             self._visits[visit].points_in(area_from_reference @ hypothesis.graph.pose(visit))
             for visit in hypothesis.topology.visits_to[area]
+            if not self._visits.is_forgotten(visit)
         ]
         return as_points(np.concatenate(clouds))
 

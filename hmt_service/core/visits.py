@@ -109,6 +109,11 @@ class Visits(Mapping[int, Visit]):
             self._visits[visit.visit] = visit
             self._extents = self._extents[: visit.visit]
 
+    def keyframes(self, visit: int) -> int:
+        """Return the number of keyframes of a visit."""
+        kept = self._visits[visit]
+        return len(kept.stamps_s if isinstance(kept, _Path) else kept.keyframes)
+
     def is_forgotten(self, visit: int) -> bool:
         """Return whether of a visit only the path is left."""
         return isinstance(self._visits[visit], _Path)

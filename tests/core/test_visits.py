@@ -35,6 +35,7 @@ def test_forgotten_visits_keep_their_path_and_nothing_else() -> None:
     visits.forget(2)
     after = visits[2]
     assert [visits.is_forgotten(visit) for visit in visits] == [False, False, True]
+    assert [visits.keyframes(visit) for visit in visits] == [5, 3, 5]
     assert len(before.points) > 0
     assert len(after.points) == sum(len(k.points_in_body) for k in after.keyframes) == 0
     assert (after.visit, after.first_keyframe, after.last_keyframe) == (2, 0, 4)
