@@ -161,20 +161,25 @@ class Engine:
         More trackings may follow, and twice is as good as once.
 
         Args:
-            is_urgent: Whether there is no time to smooth.
+            is_urgent: Whether there is no time to look for the last visit elsewhere, and to smooth.
 
         Returns:
             What was decided.
         """
-        events: tuple[Event, ...] = ()
         if self._revision > self._finished_revision:
             self._refine(self._open)
-            events = self._recognise(self._open, self._open.keyframes[-1].stamp_s)
             self._revision += 1
             self._finished_revision = self._revision
-        if self._visits and not is_urgent and self._smooth_poses() is None:
-            poses = self._smoother.smooth(self._particles.best, self._visits)
-            self._smoothed = self._revision, poses
+        if is_urgent or not self._visits or self._smooth_poses() is not None:
+            return ()
+        events = self._recognise(self._open, self._open.keyframes[-1].stamp_s)
+        if events:
+            self._revision += 1
+            self._finished_revision = self._revision
+        self._smoothed = (
+            self._revision,
+            self._smoother.smooth(self._particles.best, self._visits),
+        )
         return events
 
     def _smooth_poses(self) -> FloatArray | None:
