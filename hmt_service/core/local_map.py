@@ -232,9 +232,10 @@ class LocalMap:
         turns = np.zeros((len(_SEARCH_RAD), 6))
         turns[:, 2] = _SEARCH_RAD
         others = [self.fit(sweep, prior, motion, prior.mean @ turn) for turn in exp(turns)]
-        at_rest = [other for other in others if other.is_converged]
-        best = max(at_rest, key=lambda other: other.inlier_share, default=fit)
+        best = max(others, key=lambda other: other.inlier_share)
         least = max(_FOUND_SHARE, _BETTER * fit.inlier_share)
+        # Even one that has not come to rest: where something else explains so much more, what was
+        # found near the prediction is wrong, and no registration is better than that one.
         return best if best.inlier_share >= least else fit
 
     def glance(self, sweep: Sweep, start: Pose, information: FloatArray) -> tuple[Pose, float]:

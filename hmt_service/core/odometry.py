@@ -191,7 +191,7 @@ class Odometry:
             motion = identity()
             # Two scans of one moment are no reason to know where the second was taken.
             sigma_rad = _LOST_RAD
-            sigma_m = noise.sigma_floor_m + noise.max_speed_m_s * elapsed_s
+            sigma_m = max(noise.sigma_floor_m, noise.max_speed_m_s * elapsed_s)
         if self._sensor.is_planar:
             motion = project_planar(motion)
         covariance = isotropic_covariance(sigma_rad=sigma_rad, sigma_m=sigma_m)

@@ -144,7 +144,7 @@ def test_position_along_a_corridor_without_wheels_is_less_certain() -> None:
     assert np.sqrt(known[3, 3]) == pytest.approx(np.sqrt(10.0) * 0.02, rel=0.01)
     # Steps of 0.1 s: at first nobody knows the speed, then nobody says whether it has changed.
     motion = load_config().motion
-    first_m, next_m = 0.02 + motion.max_speed_m_s * 0.1, 0.02 + motion.acceleration_m_s2 * 0.1**2
+    first_m, next_m = motion.max_speed_m_s * 0.1, 0.02 + motion.acceleration_m_s2 * 0.1**2
     assert guessed[3, 3] == pytest.approx(first_m**2 + 9.0 * next_m**2, rel=0.02)
 
 
