@@ -34,7 +34,6 @@ BASE = 2
 _SEED = 0
 _LAPS, _QUICK_LAPS = 20, 3
 _TIMEOUT_S = 3600.0
-_LEAST_CLOSED_M = 1.0
 _COST_TOLERANCE, _MEMORY_TOLERANCE = 0.3, 0.3
 _LOWER = Direction.LOWER_IS_BETTER
 
@@ -96,8 +95,7 @@ def _driven(laps: int) -> Result:
 
     world = draw(Family.ALIASED, _SEED)
     route = np.asarray(world.route_m)
-    is_closed = np.linalg.norm(route[0] - route[-1]) < _LEAST_CLOSED_M
-    lap = route[:-1] if is_closed else np.concatenate([route, route[-2:0:-1]])
+    lap = np.concatenate([route, route[-2:0:-1]])
     world = replace(world, route_m=np.concatenate([*[lap] * laps, lap[:1]]))
     lap_m = float(np.linalg.norm(np.diff(lap, axis=0, append=lap[:1]), axis=1).sum())
     truth: list[StampedPose] = []

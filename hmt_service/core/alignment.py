@@ -19,17 +19,18 @@ from hmt_service.core.geometry import (
     GaussianPose,
     Pose,
     adjoint,
+    apart,
     certain,
     confined,
     identity,
     inverse,
     isotropic_covariance,
-    log,
     planar_pose,
     skew,
     transform_points,
     yaw_of,
 )
+from hmt_service.core.local_map import Sweep
 from hmt_service.core.submap import Visit
 
 # A prior this tight leaves one basin of attraction: registration finds it without a search.
@@ -37,14 +38,14 @@ _SINGLE_BASIN_M = 0.25
 _SINGLE_BASIN_RAD = 0.05
 # How far a guess may be off; the prior of its registration, next to nothing.
 _BASIN_M, _BASIN_RAD = 1.0, 0.3
-_NEAR = isotropic_covariance(sigma_rad=1.0 / _BASIN_RAD, sigma_m=1.0 / _BASIN_M)
+_NEAR_INFORMATION = isotropic_covariance(sigma_rad=1.0 / _BASIN_RAD, sigma_m=1.0 / _BASIN_M)
 # A guess is looked at with so few points first, and dropped if they explain less than this share of
 # the overlap that is asked for.
 _FEW_POINTS, _SCREENED = 200, 0.75
 # Searches are so much wider than asked for: the next hypothesis asks for almost the same.
 _MARGIN_M, _MARGIN_RAD = 1.0, 0.05
-_SEPARATION_M = 0.6
-_SEPARATION_RAD = 0.15
+SEPARATION_M, SEPARATION_RAD = 0.6, 0.15
+"""Poses of one submap in another that are no farther apart are one mode."""
 _SEPARATION_SIGMA = 4.0
 _PEAK_SHARE = 0.6
 
@@ -96,6 +97,8 @@ class _Known:
     """What has been found out about one visit."""
 
     visit: Visit
+    few: Sweep
+    """Some of its points: enough to drop most guesses."""
     searches: dict[Visit, list[_Search]]
     """Correlations with each target."""
     refined: dict[tuple[Visit, bytes], Mode | None]
@@ -127,7 +130,7 @@ class Aligner:
         Returns:
             Distinct modes, the one with most overlap first; empty when nothing agrees.
         """
-        if not (len(visit.points) and len(target.points)):
+        if not _have_points(visit, target):
             return ()
         refined = []
         for guess in self._guesses(visit, target, prior):
@@ -147,7 +150,7 @@ class Aligner:
             guess: Pose to start from, `target_from_visit`.
             min_overlap: Least share of the visit's points that the target must explain.
         """
-        if not (len(visit.points) and len(target.points)):
+        if not _have_points(visit, target):
             return None
         near = isotropic_covariance(sigma_rad=_BASIN_RAD, sigma_m=_BASIN_M)
         prior = GaussianPose(guess, confined(near, is_planar=self._is_planar))
@@ -169,20 +172,22 @@ class Aligner:
 
     def _refined(self, visit: Visit, target: Visit, guess: Pose) -> Mode | None:
         """Return what `refine` does, for a guess that few points speak for, and only once."""
-        known = self._known_of(visit).refined
+        known = self._known_of(visit)
         key = (target, guess.tobytes())
-        if key not in known:
+        if key not in known.refined:
             least = self._config.min_overlap
-            few = visit.sweep.every(max(len(visit.sweep.points) // _FEW_POINTS, 1))
-            pose, share = target.local_map.glance(few, guess, _NEAR)
+            pose, share = target.local_map.glance(known.few, guess, _NEAR_INFORMATION)
             is_likely = share >= _SCREENED * least
-            known[key] = self.refine(visit, target, pose, min_overlap=least) if is_likely else None
-        return known[key]
+            known.refined[key] = (
+                self.refine(visit, target, pose, min_overlap=least) if is_likely else None
+            )
+        return known.refined[key]
 
     def _known_of(self, visit: Visit) -> _Known:
         """Return what has been found out about a visit; hypotheses ask the same again and again."""
         if self._known is None or self._known.visit is not visit:
-            self._known = _Known(visit, {}, {})
+            few = visit.sweep.every(max(len(visit.sweep.points) // _FEW_POINTS, 1))
+            self._known = _Known(visit, few, {}, {})
         return self._known
 
     def _guesses(self, visit: Visit, target: Visit, prior: GaussianPose) -> list[Pose]:
@@ -274,9 +279,9 @@ class Aligner:
             least=least,
             apart=np.array(
                 [
-                    _SEPARATION_RAD / config.angle_step_rad,
-                    _SEPARATION_M / config.raster_m,
-                    _SEPARATION_M / config.raster_m,
+                    SEPARATION_RAD / config.angle_step_rad,
+                    SEPARATION_M / config.raster_m,
+                    SEPARATION_M / config.raster_m,
                 ]
             ),
             most=2 * config.max_modes,
@@ -301,6 +306,10 @@ class Aligner:
             if all(_are_apart(other.target_from_visit, pose) for other in kept):
                 kept.append(mode)
         return tuple(kept[: self._config.max_modes])
+
+
+def _have_points(visit: Visit, target: Visit) -> bool:
+    return len(visit.points) > 0 and len(target.points) > 0
 
 
 def _separate_peaks(
@@ -332,9 +341,9 @@ def _separate_peaks(
 
 
 def _are_apart(first: GaussianPose, second: GaussianPose) -> bool:
-    xi = log(inverse(first.mean) @ second.mean)
-    is_far = np.linalg.norm(xi[3:]) > _SEPARATION_M or np.linalg.norm(xi[:3]) > _SEPARATION_RAD
-    return bool(is_far and first.disagreement2(second) > _SEPARATION_SIGMA**2)
+    apart_m, apart_rad = apart(first.mean, second.mean)
+    is_far = apart_m > SEPARATION_M or apart_rad > SEPARATION_RAD
+    return is_far and first.disagreement2(second) > _SEPARATION_SIGMA**2
 
 
 def _position_covariance(pose: GaussianPose, point: FloatArray) -> FloatArray:

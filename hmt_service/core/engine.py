@@ -38,6 +38,7 @@ from hmt_service.core.stored import (
 from hmt_service.core.submap import Visit, as_points, visit_of
 from hmt_service.core.transition import Successor, Transition
 from hmt_service.core.types import (
+    NO_POINTS,
     ArcResidual,
     AreaDifference,
     Comparison,
@@ -312,7 +313,7 @@ class Engine:
         others = [v for v in to_same if v != visit.visit and not self._visits.is_forgotten(v)]
         if len(others) < most:
             return
-        poses = dict(enumerate(self._particles.best.graph.poses()))
+        poses = self._particles.best.graph.poses()
         new = share_new(visit, [self._visits[v] for v in others], poses)
         if new <= self._config.areas.max_new_share:
             self._visits.forget(visit.visit)
@@ -446,7 +447,7 @@ class Engine:
                 reference_from_area=poses[area],
                 keyframes=sum(self._visits.keyframes(v) for v in visits_to[area]),
                 visits=len(visits_to[area]),
-                points_in_area=self._submap(chosen, area) if with_points else _NO_POINTS,
+                points_in_area=self._submap(chosen, area) if with_points else NO_POINTS,
             )
             for area in chosen.topology.areas
         )
@@ -569,7 +570,6 @@ _ANY_CUT = 2.0
 _SAME_AREA = 2.0 / 3.0
 # A gap that the wheels bridge so well is none.
 _BRIDGED_M = 0.25
-_NO_POINTS: Points = np.zeros((0, 3), dtype=np.float32)
 
 
 def _said_of(tracking: Tracking) -> list[str]:

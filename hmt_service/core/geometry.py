@@ -111,6 +111,12 @@ def log(pose: FloatArray) -> FloatArray:
     return np.concatenate([phi, rho], axis=-1)
 
 
+def apart(first: Pose, second: Pose) -> tuple[float, float]:
+    """Return how far two poses are from each other, m and rad: lengths of the parts of the log."""
+    xi = log(inverse(first) @ second)
+    return float(np.linalg.norm(xi[3:])), float(np.linalg.norm(xi[:3]))
+
+
 def quaternion_of(pose: FloatArray) -> FloatArray:
     """Return rotations as unit quaternions `[x, y, z, w]`, w >= 0: (..., 4, 4) -> (..., 4)."""
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = np.moveaxis(pose[..., :3, :3], (-2, -1), (0, 1))

@@ -18,21 +18,20 @@ from itertools import pairwise
 
 import numpy as np
 
+from hmt_service.core.alignment import SEPARATION_M, SEPARATION_RAD
 from hmt_service.core.geometry import (
     FloatArray,
     GaussianPose,
     Pose,
+    apart,
     certain,
     identity,
     inverse,
-    log,
 )
 from hmt_service.core.graph import Factor, PoseGraph
 from hmt_service.core.submap import Visit
 from hmt_service.core.types import HypothesisSummary
 
-# Poses of one visit that are no farther apart are one.
-_SAME_M, _SAME_RAD = 0.6, 0.15
 # Maps that differ by no more than this anywhere are the same.
 _EQUAL_M, _EQUAL_RAD = 0.1, 0.03
 
@@ -174,8 +173,8 @@ class Hypothesis:
         if self.topology.areas != other.topology.areas:
             return False
         own, theirs = self.graph.poses(), other.graph.poses()
-        apart = np.abs(own - theirs).max(axis=0)
-        return bool(apart[:3, 3].max() <= _EQUAL_M and apart[:3, :3].max() <= _EQUAL_RAD)
+        largest = np.abs(own - theirs).max(axis=0)
+        return bool(largest[:3, 3].max() <= _EQUAL_M and largest[:3, :3].max() <= _EQUAL_RAD)
 
     def has_recognised(self, other: Hypothesis, area: int, area_from_visit: Pose) -> bool:
         """Return whether this is another hypothesis but that it ties the last visit there."""
@@ -185,8 +184,8 @@ class Hypothesis:
         if self.topology.assignments[:visit] != other.topology.assignments[:visit]:
             return False
         placed = inverse(self.graph.pose(area)) @ self.graph.pose(visit)
-        moved = log(inverse(area_from_visit) @ placed)
-        return bool(np.linalg.norm(moved[3:]) <= _SAME_M and np.linalg.norm(moved[:3]) <= _SAME_RAD)
+        apart_m, apart_rad = apart(area_from_visit, placed)
+        return apart_m <= SEPARATION_M and apart_rad <= SEPARATION_RAD
 
 
 class ParticleLayer:

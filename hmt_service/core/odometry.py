@@ -16,6 +16,7 @@ from hmt_service.core.geometry import (
     FloatArray,
     GaussianPose,
     Pose,
+    apart,
     certain,
     confined,
     exp,
@@ -246,11 +247,8 @@ class Odometry:
             return TrackingFailure.NOT_CONVERGED
         if fit.inlier_share < config.min_inlier_share:
             return TrackingFailure.TOO_FEW_CORRESPONDENCES
-        correction = log(inverse(predicted.mean) @ fit.pose)
-        if (
-            np.linalg.norm(correction[3:]) > config.max_correction_m
-            or np.linalg.norm(correction[:3]) > config.max_correction_rad
-        ):
+        moved_m, moved_rad = apart(predicted.mean, fit.pose)
+        if moved_m > config.max_correction_m or moved_rad > config.max_correction_rad:
             return TrackingFailure.CORRECTION_TOO_LARGE
         return None
 

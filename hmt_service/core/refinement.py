@@ -12,7 +12,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from hmt_service.core.alignment import Aligner, Mode
-from hmt_service.core.config import Config
+from hmt_service.core.config import Config, RefinementConfig
 from hmt_service.core.geometry import GaussianPose
 from hmt_service.core.graph import Factor
 from hmt_service.core.hypotheses import Hypothesis
@@ -21,6 +21,11 @@ from hmt_service.core.visits import Visits, gaps_m
 
 # chi-square 99.9 % for 6 degrees of freedom: a match beyond it contradicts the graph.
 _GATE = 22.46
+
+
+def is_certain(prior: GaussianPose, config: RefinementConfig) -> bool:
+    """Return whether a relative pose is known so well that the topology there is not in doubt."""
+    return prior.sigma_m <= config.max_sigma_m and prior.sigma_rad <= config.max_sigma_rad
 
 
 class Refinement:
@@ -49,7 +54,7 @@ class Refinement:
         ties: list[tuple[int, Mode]] = []
         for other in self._neighbours(hypothesis, visit, visits):
             prior = hypothesis.graph.relative(other, visit.visit)
-            if not self._is_certain(prior):
+            if not is_certain(prior, self._config):
                 continue
             mode = self._aligner.refine(
                 visit, visits[other], prior.mean, min_overlap=self._config.min_overlap
@@ -89,10 +94,6 @@ class Refinement:
             if gap <= self._config.max_gap_m
         ]
         return [area for _, _, area in sorted(near)[: self._config.max_neighbours]]
-
-    def _is_certain(self, prior: GaussianPose) -> bool:
-        config = self._config
-        return prior.sigma_m <= config.max_sigma_m and prior.sigma_rad <= config.max_sigma_rad
 
     @staticmethod
     def _agrees(prior: GaussianPose, mode: Mode) -> bool:

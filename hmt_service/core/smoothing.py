@@ -23,12 +23,12 @@ from hmt_service.core.geometry import (
     FloatArray,
     GaussianPose,
     Pose,
+    apart,
     certain,
     confined,
     identity,
     inverse,
     isotropic_covariance,
-    log,
     transform_points,
 )
 from hmt_service.core.graph import Factor, optimised
@@ -125,8 +125,8 @@ class Smoother:
         wide = isotropic_covariance(sigma_rad=_SIGMA_RAD, sigma_m=_SIGMA_M)
         near = confined(wide, is_planar=self._is_planar)
         fit = window.fit(sweep, GaussianPose(expected, near), certain(identity()), expected)
-        moved = log(inverse(expected) @ fit.pose)
-        is_near = np.linalg.norm(moved[3:]) <= _MOST_M and np.linalg.norm(moved[:3]) <= _MOST_RAD
+        moved_m, moved_rad = apart(expected, fit.pose)
+        is_near = moved_m <= _MOST_M and moved_rad <= _MOST_RAD
         if not (fit.is_converged and is_near and fit.inlier_share >= _LEAST_SHARE):
             return None
         floor = isotropic_covariance(sigma_rad=_FLOOR_RAD, sigma_m=_FLOOR_M)

@@ -26,6 +26,7 @@ from hmt_service.core.geometry import (
 from hmt_service.core.graph import Factor
 from hmt_service.core.hypotheses import Hypothesis
 from hmt_service.core.observation import ObservationModel
+from hmt_service.core.refinement import is_certain
 from hmt_service.core.submap import Visit
 from hmt_service.core.visits import Visits, gaps_m
 
@@ -116,13 +117,14 @@ class Transition:
             return ()
         here = certain(identity())
         candidates = self._candidates(
-            hypothesis, visit, visit.visit, here, visits, is_asked=self._is_in_doubt
+            hypothesis,
+            visit,
+            visit.visit,
+            here,
+            visits,
+            is_asked=lambda prior: not is_certain(prior, self._refinement),
         )
         return self._matches(visit, candidates, visits)
-
-    def _is_in_doubt(self, prior: GaussianPose) -> bool:
-        known = self._refinement
-        return prior.sigma_m > known.max_sigma_m or prior.sigma_rad > known.max_sigma_rad
 
     def _matches(
         self,

@@ -22,6 +22,8 @@ from hmt_service.core.geometry import FloatArray, GaussianPose, Pose
 
 Points = npt.NDArray[np.float32]
 """Points of a keyframe or submap, shape (N, 3), m."""
+NO_POINTS: Points = np.zeros((0, 3), dtype=np.float32)
+"""Those of one that saw nothing, or of which they are not asked for."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

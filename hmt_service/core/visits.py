@@ -18,10 +18,9 @@ from hmt_service.core.area_abstraction import cells_of
 from hmt_service.core.config import Config
 from hmt_service.core.geometry import FloatArray, GaussianPose, Pose, inverse, transform_points
 from hmt_service.core.submap import Visit, visit_of
-from hmt_service.core.types import Keyframe, Points, TrackingFailure
+from hmt_service.core.types import NO_POINTS, Keyframe, TrackingFailure
 
 _UPPER = np.triu_indices(6)
-_NO_POINTS: Points = np.zeros((0, 3), dtype=np.float32)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,7 +69,7 @@ class _Path:
         return Keyframe(
             index=self.first_keyframe + position,
             stamp_s=float(self.stamps_s[position]),
-            points_in_body=_NO_POINTS,
+            points_in_body=NO_POINTS,
             sensor_in_body=self.sensors_in_body[position].astype(np.float64),
             previous_from_body=GaussianPose(motion, covariance),
             own_error=own_error,
@@ -134,13 +133,13 @@ class Visits(Mapping[int, Visit]):
         return self._extents[:count]
 
 
-def share_new(visit: Visit, others: Iterable[Visit], poses: Mapping[int, Pose]) -> float:
+def share_new(visit: Visit, others: Iterable[Visit], poses: FloatArray) -> float:
     """Return the share of the cells of a visit that no other has points in, in [0, 1].
 
     Args:
         visit: The visit.
         others: Visits that it is compared with.
-        poses: Poses of all of them, in one frame.
+        poses: Those of all visits by their numbers, in one frame, shape (V, 4, 4).
     """
     cell_m = visit.config.areas.cell_size_m
     seen = cells_of(visit.points, cell_m)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hmt_service.core.geometry import Pose, inverse, planar_pose
+from hmt_service.core.geometry import FloatArray, inverse, planar_pose
 from hmt_service.core.stored import ScanLog
 from hmt_service.core.submap import Visit
 from hmt_service.core.visits import Visits, gaps_m, share_new
@@ -25,8 +25,8 @@ def three() -> list[Visit]:
     ]
 
 
-def poses() -> dict[int, Pose]:
-    return dict(enumerate([PATH[0], FAR[0], PATH[-1]]))
+def poses() -> FloatArray:
+    return np.array([PATH[0], FAR[0], PATH[-1]])
 
 
 def test_forgotten_visits_keep_their_path_and_nothing_else() -> None:
@@ -63,13 +63,14 @@ def test_what_another_visit_has_seen_is_not_new() -> None:
     assert share_new(again, [other], poses()) == 1.0
     assert share_new(again, [], poses()) == 1.0
     # The same submap somewhere else would be new there.
-    moved = {**poses(), 0: PATH[0] @ planar_pose(1.0, 1.0, 0.5)}
+    moved = poses()
+    moved[0] = PATH[0] @ planar_pose(1.0, 1.0, 0.5)
     assert share_new(again, [first], moved) > 0.5
 
 
 def test_gap_is_what_lies_between_the_paths() -> None:
     visits = Visits(three())
-    placed = np.array([*poses().values()])
+    placed = poses()
     gaps = gaps_m(visits[2], placed[2], placed[:2], visits.extents(2))
     apart = np.linalg.norm((FAR[0][:3, 3] + FAR[-1][:3, 3] - PATH[0][:3, 3] - PATH[-1][:3, 3]) / 2)
     assert gaps == pytest.approx([-2.0, apart - 1.5])
