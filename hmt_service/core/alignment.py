@@ -7,13 +7,12 @@ References:
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import fft, ndimage
 
 from hmt_service.core.config import Config
+from hmt_service.core.correlation import Raster
 from hmt_service.core.geometry import (
     FloatArray,
     GaussianPose,
@@ -39,9 +38,9 @@ _SINGLE_BASIN_RAD = 0.05
 # How far a guess may be off; the prior of its registration, next to nothing.
 _BASIN_M, _BASIN_RAD = 1.0, 0.3
 _NEAR_INFORMATION = isotropic_covariance(sigma_rad=1.0 / _BASIN_RAD, sigma_m=1.0 / _BASIN_M)
-# A guess is looked at with so few points first, and dropped if they explain less than this share of
-# the overlap that is asked for.
-_FEW_POINTS, _SCREENED = 200, 0.75
+# A guess is looked at from above, then with so few points, and dropped if that explains less than
+# these shares of the overlap that is asked for.
+_FEW_POINTS, _FROM_ABOVE, _AT_A_GLANCE = 200, 0.75, 0.85
 # Searches are so much wider than asked for: the next hypothesis asks for almost the same.
 _MARGIN_M, _MARGIN_RAD = 1.0, 0.05
 SEPARATION_M, SEPARATION_RAD = 0.6, 0.15
@@ -177,7 +176,7 @@ class Aligner:
         if key not in known.refined:
             least = self._config.min_overlap
             pose, share = target.local_map.glance(known.few, guess, _NEAR_INFORMATION)
-            is_likely = share >= _SCREENED * least
+            is_likely = share >= _AT_A_GLANCE * least
             known.refined[key] = (
                 self.refine(visit, target, pose, min_overlap=least) if is_likely else None
             )
@@ -212,86 +211,31 @@ class Aligner:
         return searches[-1].guesses
 
     def _correlate(self, visit: Visit, target: Visit, region: _Region) -> list[Pose]:
-        """Return the best poses on a raster: correlation by FFT, one rotation at a time."""
+        """Return the best poses on a raster, seen from above; height and tilt are the region's."""
         config = self._config
-        cell = config.raster_m
-        reach_m = region.reach_m + cell
-        steps = int(np.ceil(region.reach_rad / config.angle_step_rad))
-        turns = np.unique(np.linspace(-region.reach_rad, region.reach_rad, 2 * steps + 1))
-
-        target_points = target.points[:, :2]
-        low = target_points.min(axis=0) - cell
-        height, width = np.ceil((target_points.max(axis=0) + cell - low) / cell).astype(int) + 1
-        raster = np.zeros((height, width), dtype=np.float32)
-        i, j = ((target_points - low) / cell).astype(int).T
-        raster[i, j] = 1.0
-        raster = np.minimum(ndimage.gaussian_filter(raster, 0.7) * 3.0, 1.0)
-
-        centred = visit.points - visit.centre
-        extent = int(np.ceil(np.abs(centred[:, :2]).max() * np.sqrt(2.0) / cell)) + 1
-        shape = tuple(
-            fft.next_fast_len(int(n) + 2 * extent + 1, real=True) for n in (height, width)
-        )
-        spectrum = fft.rfft2(raster, shape)
-        # Where the middle of the visit is expected to be in the target's frame.
-        rows = low[0] + (np.arange(shape[0]) - extent + 0.5) * cell
-        columns = low[1] + (np.arange(shape[1]) - extent + 0.5) * cell
-        is_inside = (rows[:, None] - region.centre[0]) ** 2 + (
-            columns[None, :] - region.centre[1]
-        ) ** 2 <= reach_m**2
-        if not np.any(is_inside):
-            return []
-        # Only the window around the search region is kept: a full circle would not fit otherwise.
-        window = tuple(
-            slice(int(hit[0]), int(hit[-1]) + 1)
-            for hit in (np.flatnonzero(is_inside.any(axis=axis)) for axis in (1, 0))
-        )
-        scores = []
-        for turn in turns:
-            yaw = yaw_of(region.mean) + turn
-            rotated = transform_points(planar_pose(0.0, 0.0, yaw), centred)[:, :2]
-            stamp = np.zeros(shape, dtype=np.float32)
-            rows_hit, columns_hit = np.round(rotated / cell).astype(int).T
-            stamp[rows_hit % shape[0], columns_hit % shape[1]] = 1.0
-            stamp /= np.sum(stamp)
-            score = fft.irfft2(spectrum * np.conj(fft.rfft2(stamp)), shape)
-            # Index k stands for a shift by k cells, wrapped; row 0 of `rows` is shift -extent.
-            score = np.roll(score, (extent, extent), axis=(0, 1))
-            scores.append(np.where(is_inside, score, 0.0)[window].astype(np.float32))
-        return self._peaks(
-            np.stack(scores), turns, rows[window[0]], columns[window[1]], visit, region.mean
-        )
-
-    def _peaks(
-        self,
-        scores: np.ndarray,
-        turns: FloatArray,
-        rows: FloatArray,
-        columns: FloatArray,
-        visit: Visit,
-        mean: Pose,
-    ) -> list[Pose]:
-        """Return the poses of the separate local maxima of the correlation, best first."""
-        config = self._config
-        least = max(_PEAK_SHARE * float(scores.max()), 0.5 * config.min_overlap)
-        found = _separate_peaks(
-            scores,
-            least=least,
-            apart=np.array(
-                [
-                    SEPARATION_RAD / config.angle_step_rad,
-                    SEPARATION_M / config.raster_m,
-                    SEPARATION_M / config.raster_m,
-                ]
+        yaw = yaw_of(region.mean)
+        upright = planar_pose(0.0, 0.0, -yaw)[:3, :3] @ region.mean[:3, :3]
+        peaks = target.view.best_peaks(
+            (visit.points - visit.centre) @ upright.T,
+            visit.seen.directions @ upright.T,
+            middle=region.centre[:2],
+            yaw=yaw,
+            reach_m=region.reach_m,
+            reach_rad=region.reach_rad,
+            raster=Raster(
+                step_rad=config.angle_step_rad,
+                least=_FROM_ABOVE * config.min_overlap,
+                peak_share=_PEAK_SHARE,
+                separation_m=SEPARATION_M,
+                separation_rad=SEPARATION_RAD,
+                most=2 * config.max_modes,
             ),
-            most=2 * config.max_modes,
         )
         poses = []
-        for turn, row, column in found:
-            pose = mean.copy()
-            pose[:3, :3] = planar_pose(0.0, 0.0, float(turns[turn]))[:3, :3] @ mean[:3, :3]
-            centre = pose[:3, :3] @ visit.centre
-            pose[:2, 3] = rows[row] - centre[0], columns[column] - centre[1]
+        for peak in peaks:
+            pose = region.mean.copy()
+            pose[:3, :3] = planar_pose(0.0, 0.0, peak.yaw)[:3, :3] @ upright
+            pose[:2, 3] = peak.position - (pose[:3, :3] @ visit.centre)[:2]
             poses.append(pose)
         return poses
 
@@ -310,34 +254,6 @@ class Aligner:
 
 def _have_points(visit: Visit, target: Visit) -> bool:
     return len(visit.points) > 0 and len(target.points) > 0
-
-
-def _separate_peaks(
-    scores: np.ndarray, *, least: float, apart: FloatArray, most: int
-) -> list[tuple[int, ...]]:
-    """Return the cells of a grid that no neighbour exceeds, the highest first.
-
-    Args:
-        scores: Grid, shape (T, R, C).
-        least: Lowest score that counts.
-        apart: Distance along each axis, in cells, within which only the highest peak is kept.
-        most: Most peaks returned.
-    """
-    cells = np.argwhere(scores >= least)
-    heights = scores[tuple(cells.T)]
-    limit = np.array(scores.shape) - 1
-    is_peak = np.ones(len(cells), dtype=bool)
-    for step in itertools.product((-1, 0, 1), repeat=3):
-        is_peak &= heights >= scores[tuple(np.clip(cells + step, 0, limit).T)]
-    cells, heights = cells[is_peak], heights[is_peak]
-    peaks: list[tuple[int, ...]] = []
-    while len(cells) and len(peaks) < most:
-        # Of equal heights the first in the order of the grid.
-        peak = cells[int(np.argmax(heights))]
-        peaks.append(tuple(int(index) for index in peak))
-        is_left = np.any(np.abs(cells - peak) > apart, axis=1)
-        cells, heights = cells[is_left], heights[is_left]
-    return peaks
 
 
 def _are_apart(first: GaussianPose, second: GaussianPose) -> bool:

@@ -128,7 +128,7 @@ class AreaConfig(Section):
     """Fewest keyframes on either side of a border."""
     max_keyframes: int = Field(default=200, ge=4)
     """An area visit of so many keyframes is cut at its cheapest border, whatever that costs."""
-    max_views: int = Field(default=3, ge=1)
+    max_views: int = Field(default=2, ge=1)
     """Of so many visits to an area the scans are kept; of more, only if they show something new."""
     max_new_share: float = Field(default=0.1, ge=0.0, le=1.0)
     """A visit shows nothing new if no more than this share of what it saw is unknown."""

@@ -211,6 +211,7 @@ class Engine:
         stamp_s = opened.keyframes[-1].stamp_s
         merged = self._pruned(self._particles.merge(), stamp_s, "merged")
         recognised = (*merged, *self._forget(stamp_s), *self._recognise(closed, stamp_s))
+        self._forget_visit(closed.visit - 1)
         arc = Factor(closed.visit, opened.visit, motion)
         self._motions.append(arc)
         expanded = [
@@ -219,7 +220,6 @@ class Engine:
             for successor in self._expand(hypothesis, opened, arc)
         ]
         self._visits.put(opened)
-        self._forget_scans(closed)
         pruned = self._pruned(self._particles.replace(expanded), stamp_s)
         branched = self._branched(len(expanded), stamp_s)
         return (*recognised, self._entered(stamp_s), *branched, *pruned)
@@ -301,22 +301,24 @@ class Engine:
         self._weighed.clear()
         self._particles.reweight(lambda h: -sum(said.get(h.hypothesis, 0.0) for said in taken_back))
 
-    def _forget_scans(self, visit: Visit) -> None:
+    def _forget_visit(self, visit: int) -> None:
         """Keep the path only of a visit that shows nothing new of an area that is well known.
 
         All hypotheses must agree that it did not found one: what founders saw is compared with.
+        The visits before and after it must have been refined, so that no arc to it is to come.
         """
-        best, most = self._particles.best.topology, self._config.areas.max_views
-        if any(visit.visit in h.topology.areas for h in self._particles.hypotheses):
+        best, hypotheses = self._particles.best, self._particles.hypotheses
+        if visit < 0 or any(visit in h.topology.areas for h in hypotheses):
             return
-        to_same = best.visits_to[best.assignments[visit.visit].area]
-        others = [v for v in to_same if v != visit.visit and not self._visits.is_forgotten(v)]
-        if len(others) < most:
+        to_same = best.topology.visits_to[best.topology.assignments[visit].area]
+        others = [v for v in to_same if v != visit and not self._visits.is_forgotten(v)]
+        if len(others) < self._config.areas.max_views:
             return
-        poses = self._particles.best.graph.poses()
-        new = share_new(visit, [self._visits[v] for v in others], poses)
+        known = [self._visits[other] for other in others]
+        new = share_new(self._visits[visit], known, best.graph.poses())
         if new <= self._config.areas.max_new_share:
-            self._visits.forget(visit.visit)
+            self._visits.forget(visit)
+            self._particles.replace([h.without(visit) for h in hypotheses])
 
     def _refine(self, visit: Visit) -> None:
         """Let every hypothesis use all of a visit that is over, not only its beginning."""

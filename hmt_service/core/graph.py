@@ -6,14 +6,16 @@ at every size (an arc 0.1 ms at 100 poses and 2 ms at 10,000, where a batch take
 References:
     Blanco et al. 2008, section IV-C (globally consistent poses), after Lu and Milios 1997.
     Kaess et al., iSAM2: incremental smoothing and mapping using the Bayes tree, IJRR 2012.
+    Kretzschmar and Stachniss, Information-theoretic compression of pose graphs for laser-based
+    SLAM, IJRR 2012 (what an eliminated pose says is kept in sparse arcs).
 """
 
 from __future__ import annotations
 
 import weakref
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -182,10 +184,18 @@ class _Solver:
         self.poses: dict[int, Pose] = {}
         self.relatives: dict[tuple[int, int], GaussianPose] = {}
 
-    def update(self, reference: int | None, factors: Iterable[Factor]) -> None:
-        """Solve with some more arcs; one between the same two visits replaces what was there."""
+    def update(
+        self,
+        reference: int | None,
+        factors: Iterable[Factor],
+        removed: Iterable[tuple[int, int]] = (),
+    ) -> None:
+        """Solve with some more arcs, and without some; a visit that has none left is gone.
+
+        An arc between the same two visits replaces what was there.
+        """
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        replaced: list[int] = []
+        replaced = [self._index_of.pop(key) for key in removed if key in self._index_of]
         if reference is not None:
             graph.add(self._space.reference(reference))
             values.insert(reference, self._space.value(identity()))
@@ -221,9 +231,14 @@ class _Solver:
             self.poses[visit] = self._space.estimate(self._isam, visit)
         return self.poses[visit]
 
-    def all_poses(self) -> FloatArray:
+    def all_poses(self, held: Mapping[int, tuple[int, Pose]]) -> FloatArray:
         if self._all_poses is None:
-            self._all_poses = self._space.poses(self._isam.calculateEstimate())
+            solved = self._space.poses(self._isam.calculateEstimate())
+            is_held = np.isin(np.arange(len(solved) + len(held)), list(held))
+            self._all_poses = np.empty((len(is_held), 4, 4))
+            self._all_poses[~is_held] = solved
+            for visit, (anchor, anchor_from_visit) in held.items():
+                self._all_poses[visit] = self._all_poses[anchor] @ anchor_from_visit
         return self._all_poses
 
     def covariance(self, visit: int) -> FloatArray:
@@ -252,6 +267,8 @@ class PoseGraph:
         self._visits: dict[int, None] = {}
         self._factors: dict[tuple[int, int], Factor] = {}
         self._pending: dict[tuple[int, int], Factor] = {}
+        self._removed: tuple[tuple[int, int], ...] = ()
+        self._held: dict[int, tuple[int, Pose]] = {}
         self._use(_Solver(self._space))
 
     def copy(self) -> PoseGraph:
@@ -260,6 +277,7 @@ class PoseGraph:
         other._visits = dict(self._visits)
         other._factors = dict(self._factors)
         other._pending = dict(self._pending)
+        other._held = dict(self._held)
         other._use(self._solver)
         return other
 
@@ -288,20 +306,57 @@ class PoseGraph:
         self._factors[key] = self._pending[key] = factor
         self._visits.setdefault(factor.visit_b)
 
+    def eliminate(self, visit: int, anchor: int) -> None:
+        """Take a visit out, and keep what it says of those that it has arcs to, Eq. (10).
+
+        Exact for a visit between two others. Where there are more, what is known of it by its arc
+        to the anchor is shared out among the arcs that follow from it, so that nothing counts
+        twice.
+
+        Args:
+            visit: What is taken out; later arcs may not lead to it.
+            anchor: A visit that it has an arc to: it keeps its place beside that one.
+        """
+        self._held[visit] = anchor, inverse(self.pose(anchor)) @ self.pose(visit)
+        arcs = {key: _between(arc, visit) for key, arc in self._factors.items() if visit in key}
+        known = arcs.pop(_key(visit, anchor)).inverse()
+        shared = GaussianPose(known.mean, max(len(arcs), 1) * known.covariance)
+        for (first, second), visit_from_other in arcs.items():
+            other = second if first == visit else first
+            self._fuse(Factor(anchor, other, shared @ visit_from_other))
+        for key in (*arcs, _key(visit, anchor)):
+            del self._factors[key]
+            self._pending.pop(key, None)
+            self._removed = (*self._removed, key)
+
+    def _fuse(self, factor: Factor) -> None:
+        """Add an arc to what is known of the same two visits by other observations."""
+        key = _key(factor.visit_a, factor.visit_b)
+        if key in self._factors:
+            known = _between(self._factors[key], factor.visit_a)
+            factor = replace(factor, a_from_b=known.fuse(factor.a_from_b))
+        self.add_factor(factor)
+
     def has_arc(self, visit_a: int, visit_b: int) -> bool:
         """Return whether there is an arc between two visits."""
         return _key(visit_a, visit_b) in self._factors
 
     def pose(self, visit: int) -> Pose:
         """Return the globally consistent pose of a visit's frame, shape (4, 4)."""
+        if visit in self._held:
+            anchor, anchor_from_visit = self._held[visit]
+            return self.pose(anchor) @ anchor_from_visit
         return self._solved().pose(visit)
 
     def poses(self) -> FloatArray:
         """Return the globally consistent poses of all visits by their numbers, shape (V, 4, 4)."""
-        return self._solved().all_poses()
+        return self._solved().all_poses(self._held)
 
     def relative(self, visit_a: int, visit_b: int) -> GaussianPose:
-        """Return `a_from_b` with its covariance from the joint marginal of the two visits."""
+        """Return `a_from_b` with its covariance from the joint marginal of the two visits.
+
+        Neither may have been eliminated.
+        """
         known = self._solved().relatives
         if (visit_a, visit_b) not in known:
             known[visit_a, visit_b] = self._relative(visit_a, visit_b)
@@ -327,13 +382,18 @@ class PoseGraph:
         solver.graphs.add(self)
 
     def _solved(self) -> _Solver:
-        if self._pending:
+        if self._pending or self._removed:
             if len(self._solver.graphs) > 1:
                 self._solver.graphs.discard(self)
                 self._use(self._solver.copy())
-            pending, self._pending = self._pending, {}
-            self._solver.update(None, pending.values())
+            self._solver.update(None, self._pending.values(), self._removed)
+            self._pending, self._removed = {}, ()
         return self._solver
+
+
+def _between(factor: Factor, visit: int) -> GaussianPose:
+    """Return what an arc says of its other end, in the frame of one of its ends."""
+    return factor.a_from_b if factor.visit_a == visit else factor.a_from_b.inverse()
 
 
 def _key(visit_a: int, visit_b: int) -> tuple[int, int]:

@@ -168,6 +168,12 @@ class Hypothesis:
             topology = topology.with_visit(Assignment(visit, area, area_from_visit))
         return Hypothesis(hypothesis, log_weight, topology, graph, self.unlikely_for)
 
+    def without(self, visit: int) -> Hypothesis:
+        """Return this hypothesis with what a visit says in the arcs of its area (section IV-D)."""
+        graph = self.graph.copy()
+        graph.eliminate(visit, self.topology.assignments[visit].area)
+        return replace(self, graph=graph)
+
     def is_same_map(self, other: Hypothesis) -> bool:
         """Return whether the other has the same areas, and all visits where this one has them."""
         if self.topology.areas != other.topology.areas:

@@ -6,12 +6,13 @@ References:
 
 from __future__ import annotations
 
-from hmt_service.core import local_map, transients
+from hmt_service.core import correlation, local_map, transients
 from hmt_service.core.config import Config, Preset, load_config
 
 
 def compile_kernels(config: Config) -> None:
     """Compile what a sensor's maps need, or load it, before the first scan."""
+    correlation.compile_kernels()
     local_map.compile_kernels(is_planar=config.sensor.is_planar)
     transients.compile_kernels(config)
 

@@ -11,7 +11,7 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -36,6 +36,7 @@ from hmt_service.core.hypotheses import Hypothesis
 from hmt_service.core.local_map import LocalMap, SeenPoints, Sweep
 from hmt_service.core.submap import Visit
 from hmt_service.core.types import Keyframe
+from hmt_service.core.visits import Visits
 
 # Keyframes look at the same when the middles of what they see are so near.
 _NEAR_M = 4.0
@@ -67,29 +68,52 @@ class Smoother:
         # Keyframes that share a local map, or a window, have nothing new to say of each other.
         self._gap = max(config.odometry.window_keyframes, _WINDOW + _STRIDE)
 
-    def smooth(self, hypothesis: Hypothesis, visits: Mapping[int, Visit]) -> FloatArray:
+    def smooth(self, hypothesis: Hypothesis, visits: Visits) -> FloatArray:
         """Return `reference_from_keyframe` of every keyframe, shape (K, 4, 4).
+
+        Visits that were forgotten keep their places in their areas.
 
         Args:
             hypothesis: Says which keyframes are near each other.
             visits: All visits.
         """
-        keyframes = [keyframe for visit in visits.values() for keyframe in visit.keyframes]
         poses = hypothesis.keyframe_poses(visits)
-        ties = self._ties(keyframes, poses)
+        kept = [visit for number, visit in visits.items() if not visits.is_forgotten(number)]
+        smoothed = self._smoothed(hypothesis, kept, poses)
+        first_of = {visit.visit: visit.first_keyframe for visit in kept}
+        for visit in visits.values():
+            if visit.visit not in first_of:
+                founder = first_of[hypothesis.topology.assignments[visit.visit].area]
+                moved = smoothed[founder] @ inverse(poses[founder])
+                own = slice(visit.first_keyframe, visit.last_keyframe + 1)
+                smoothed[own] = moved @ poses[own]
+        return smoothed
+
+    def _smoothed(
+        self, hypothesis: Hypothesis, kept: Sequence[Visit], poses: FloatArray
+    ) -> FloatArray:
+        """Return the poses of all keyframes, those of visits that were kept estimated together."""
+        keyframes = [keyframe for visit in kept for keyframe in visit.keyframes]
+        indices = np.array([keyframe.index for keyframe in keyframes])
+        ties = self._ties(keyframes, poses[indices])
+        smoothed = poses.copy()
         if not ties:
-            return poses
-        known = [*_motions(keyframes), *_alignments(hypothesis, visits)]
-        solved = optimised(poses, _one_per_pair([*known, *ties]), is_planar=self._is_planar)
-        agreed = [tie for tie in ties if _distance2(tie, solved) <= _GATE]
-        if len(agreed) == len(ties):
-            return solved
-        return optimised(solved, _one_per_pair([*known, *agreed]), is_planar=self._is_planar)
+            return smoothed
+        known = [*_motions(keyframes), *_alignments(hypothesis, kept)]
+        solved = poses[indices]
+        for _ in range(2):
+            solved = optimised(solved, _one_per_pair([*known, *ties]), is_planar=self._is_planar)
+            agreed = [tie for tie in ties if _distance2(tie, solved) <= _GATE]
+            if len(agreed) == len(ties):
+                break
+            ties = agreed
+        smoothed[indices] = solved
+        return smoothed
 
     def _ties(self, keyframes: Sequence[Keyframe], poses: FloatArray) -> list[Factor]:
         """Return what each keyframe says of its pose among those of other times."""
         seen = [self._seen(keyframe) for keyframe in keyframes]
-        # Of forgotten keyframes nothing is left to be compared.
+        # Of keyframes that saw nothing nothing can be compared.
         kept = np.array([index for index, each in enumerate(seen) if len(each.points)])
         views = np.full((len(keyframes), 3), np.inf)
         for index in kept:
@@ -164,21 +188,21 @@ def _motions(keyframes: Sequence[Keyframe]) -> list[Factor]:
     """
     return [
         Factor(before, before + 1, keyframe.previous_from_body)
-        for before, (_, keyframe) in enumerate(pairwise(keyframes))
+        for before, (last, keyframe) in enumerate(pairwise(keyframes))
+        if keyframe.index == last.index + 1
     ]
 
 
-def _alignments(hypothesis: Hypothesis, visits: Mapping[int, Visit]) -> list[Factor]:
+def _alignments(hypothesis: Hypothesis, visits: Sequence[Visit]) -> list[Factor]:
     """Return what ties visits to others than their neighbours, between their first keyframes.
 
     Where the odometry was lost between two visits, nothing else says where the second is.
     """
+    sizes = [len(visit.keyframes) for visit in visits]
+    firsts = np.concatenate([[0], np.cumsum(sizes[:-1])]).tolist()
+    first_of = {visit.visit: first for visit, first in zip(visits, firsts, strict=True)}
     return [
-        Factor(
-            visits[factor.visit_a].first_keyframe,
-            visits[factor.visit_b].first_keyframe,
-            factor.a_from_b,
-        )
+        Factor(first_of[factor.visit_a], first_of[factor.visit_b], factor.a_from_b)
         for factor in hypothesis.graph.factors
         if factor.visit_b != factor.visit_a + 1
     ]

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hmt_service.core.geometry import GaussianPose, Pose
+from hmt_service.core.geometry import GaussianPose, Pose, exp, log
 from hmt_service.core.types import Keyframe
 
 
@@ -83,24 +83,23 @@ class StoredScan:
 
 
 class ScanLog:
-    """Scans as they come, 64 bytes each: how far they are from keyframes, in single precision."""
+    """Scans as they come, 36 bytes each: how far they are from keyframes, in single precision."""
 
     def __init__(self) -> None:
         """Start empty."""
         self._stamps_s = array("d")
-        self._keyframes = array("q")
-        self._poses = array("f")
+        self._keyframes = array("i")
+        self._tangents = array("f")
 
     def append(self, stamp_s: float, keyframe_index: int, keyframe_from_body: Pose) -> None:
         """Add the next scan."""
         self._stamps_s.append(stamp_s)
         self._keyframes.append(keyframe_index)
-        self._poses.extend(keyframe_from_body[:3].ravel())
+        self._tangents.extend(log(keyframe_from_body))
 
     def __iter__(self) -> Iterator[StoredScan]:
         """Iterate over the scans in the order that they came."""
-        poses = np.tile(np.eye(4), (len(self._stamps_s), 1, 1))
-        poses[:, :3] = np.array(self._poses).reshape(-1, 3, 4)
+        poses = exp(np.array(self._tangents, dtype=np.float64).reshape(-1, 6))
         return map(StoredScan, self._stamps_s, self._keyframes, poses)
 
 

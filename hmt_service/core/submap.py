@@ -19,6 +19,7 @@ import numpy as np
 
 from hmt_service.core.area_abstraction import Cells, cells_of
 from hmt_service.core.config import Config
+from hmt_service.core.correlation import View
 from hmt_service.core.geometry import (
     FloatArray,
     GaussianPose,
@@ -36,7 +37,8 @@ from hmt_service.core.types import Keyframe, Points
 
 # Size of the cells that a submap keeps one point of, over those of the local map.
 _SUBMAP_CELLS = 0.5
-# Surfels take several times what the points do: so many local maps are kept, the last used.
+# Surfels and views take several times what the points do: of so many visits they are kept, the last
+# used.
 _LOCAL_MAPS = 24
 
 
@@ -123,6 +125,11 @@ class Visit:
         """The submap, ready to register others in it."""
         return _local_map_of(self)
 
+    @property
+    def view(self) -> View:
+        """The submap seen from above, ready to be searched for others."""
+        return _view_of(self)
+
     @cached_property
     def bend(self) -> FloatArray:
         """Covariance of the visit's frame where its content is known, shape (6, 6).
@@ -182,6 +189,12 @@ class Visit:
         later = visit_of(self.visit + 1, self.keyframes[first_of_new:], self.config)
         last, new = earlier.keyframes[-1], later.keyframes[0]
         return earlier, later, _chained(earlier.visit_from_keyframe[-1], last, new)
+
+
+@lru_cache(maxsize=_LOCAL_MAPS)
+def _view_of(visit: Visit) -> View:
+    seen, cell_m = visit.seen, visit.config.alignment.raster_m
+    return View.of(seen.points, seen.directions, cell_m=cell_m)
 
 
 @lru_cache(maxsize=_LOCAL_MAPS)

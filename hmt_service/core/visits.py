@@ -1,7 +1,8 @@
 """All visits of a map: where they are, and what is kept of them.
 
 What a robot sees again and again need not be kept again and again. The visits that founded areas,
-and some more to each, keep their scans; of a later one that shows nothing new only the path stays.
+and some more to each, keep their scans; of a later one that shows nothing new only the path stays,
+and what it says of the areas around it is in their arcs.
 
 References:
     Blanco et al. 2008, sections IV-D and V (the memory must not grow with the length of the path).
@@ -13,44 +14,50 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import KDTree
 
-from hmt_service.core.area_abstraction import cells_of
 from hmt_service.core.config import Config
-from hmt_service.core.geometry import FloatArray, GaussianPose, Pose, inverse, transform_points
+from hmt_service.core.geometry import (
+    PLANAR_AXES,
+    FloatArray,
+    GaussianPose,
+    Pose,
+    confined,
+    inverse,
+    transform_points,
+)
 from hmt_service.core.submap import Visit, visit_of
 from hmt_service.core.types import NO_POINTS, Keyframe, TrackingFailure
-
-_UPPER = np.triu_indices(6)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Path:
-    """What stays of a visit whose scans are forgotten: about 400 bytes per keyframe."""
+    """What stays of a visit that is forgotten: 100 to 170 bytes per keyframe."""
 
     visit: int
     first_keyframe: int
     stamps_s: FloatArray
     sensors_in_body: FloatArray
     motions: FloatArray
-    """Means of the motions since the keyframe before, shape (K, 3, 4)."""
+    """Motions since the keyframe before in single precision, shape (K, 3, 4)."""
     covariances: FloatArray
-    """Of these, and of the keyframes alone: upper halves in single precision, shape (K, 2, 21)."""
+    """Of these: upper halves in single precision, shape (K, 6) in the plane, (K, 21) in space."""
     failures: tuple[TrackingFailure | None, ...]
     config: Config
 
     @classmethod
     def of(cls, visit: Visit) -> _Path:
         keyframes = visit.keyframes
-        covariances = np.array(
-            [[k.previous_from_body.covariance[_UPPER], k.own_error[_UPPER]] for k in keyframes]
-        )
         return cls(
             visit.visit,
             visit.first_keyframe,
             np.array([k.stamp_s for k in keyframes]),
             np.array([k.sensor_in_body for k in keyframes], dtype=np.float32),
-            np.array([k.previous_from_body.mean[:3] for k in keyframes]),
-            covariances.astype(np.float32),
+            np.array([k.previous_from_body.mean[:3] for k in keyframes], dtype=np.float32),
+            np.array(
+                [k.previous_from_body.covariance[_upper(visit.config)] for k in keyframes],
+                dtype=np.float32,
+            ),
             tuple(k.failure for k in keyframes),
             visit.config,
         )
@@ -61,10 +68,11 @@ class _Path:
         return visit_of(self.visit, keyframes, self.config)
 
     def _keyframe(self, position: int) -> Keyframe:
-        covariance, own_error = np.zeros((2, 6, 6))
-        for matrix, half in zip((covariance, own_error), self.covariances[position], strict=True):
-            matrix[_UPPER] = half
-            matrix.T[_UPPER] = half
+        covariance = np.zeros((6, 6))
+        covariance[_upper(self.config)] = self.covariances[position]
+        covariance = confined(
+            covariance + np.triu(covariance, 1).T, is_planar=self.config.sensor.is_planar
+        )
         motion = np.vstack([self.motions[position], [0.0, 0.0, 0.0, 1.0]])
         return Keyframe(
             index=self.first_keyframe + position,
@@ -72,9 +80,16 @@ class _Path:
             points_in_body=NO_POINTS,
             sensor_in_body=self.sensors_in_body[position].astype(np.float64),
             previous_from_body=GaussianPose(motion, covariance),
-            own_error=own_error,
+            own_error=np.zeros((6, 6)),
             failure=self.failures[position],
         )
+
+
+def _upper(config: Config) -> tuple[np.ndarray, np.ndarray]:
+    """Return the places of what a covariance consists of."""
+    axes = PLANAR_AXES if config.sensor.is_planar else np.arange(6)
+    rows, columns = np.triu_indices(len(axes))
+    return axes[rows], axes[columns]
 
 
 class Visits(Mapping[int, Visit]):
@@ -134,20 +149,22 @@ class Visits(Mapping[int, Visit]):
 
 
 def share_new(visit: Visit, others: Iterable[Visit], poses: FloatArray) -> float:
-    """Return the share of the cells of a visit that no other has points in, in [0, 1].
+    """Return the share of the points of a visit that none of another is near to, in [0, 1].
 
     Args:
         visit: The visit.
         others: Visits that it is compared with.
         poses: Those of all visits by their numbers, in one frame, shape (V, 4, 4).
     """
-    cell_m = visit.config.areas.cell_size_m
-    seen = cells_of(visit.points, cell_m)
-    if not len(seen):
+    near_m = visit.config.areas.cell_size_m
+    if not len(visit.points):
         return 0.0
     here = inverse(poses[visit.visit])
-    known = [cells_of(other.points_in(here @ poses[other.visit]), cell_m) for other in others]
-    return float(np.mean(~np.isin(seen, np.concatenate(known)))) if known else 1.0
+    known = [other.points_in(here @ poses[other.visit]) for other in others]
+    if not known:
+        return 1.0
+    distances, _ = KDTree(np.concatenate(known)).query(visit.points, distance_upper_bound=near_m)
+    return float(np.mean(np.isinf(distances)))
 
 
 def gaps_m(visit: Visit, here: Pose, poses: FloatArray, extents: FloatArray) -> FloatArray:

@@ -72,7 +72,9 @@ class WheelCalibration:
         jacobian[0] = [0.0, turned, length]
         jacobian[1:, 0] = xi[3:5]
         noise, white = self._noise, np.zeros(3)
-        white[0] = noise.sigma_rotation_share * turned + noise.sigma_rotation_rad_per_m * length
+        white[0] = (
+            noise.sigma_rotation_share * abs(turned) + noise.sigma_rotation_rad_per_m * length
+        )
         white[1:] = noise.sigma_translation_share * length
         seen = covariance[np.ix_(PLANAR_AXES, PLANAR_AXES)] + np.diag((_WHITE * white) ** 2)
         innovation = jacobian @ self._covariance @ jacobian.T + seen

@@ -177,6 +177,59 @@ def test_arc_between_the_same_visits_is_replaced() -> None:
     assert math.sqrt(graph.relative(1, 0).covariance[3, 3]) == pytest.approx(0.2, rel=1e-3)
 
 
+def test_a_visit_between_two_others_is_eliminated_without_loss() -> None:
+    graph = chain(*[gaussian(planar_pose(1.0, 0.2, 0.3))] * 3)
+    graph.add_factor(Factor(0, 3, gaussian(planar_pose(2.0, 1.5, 1.0), sigma_m=0.2)))
+    before, other = [graph.relative(0, visit) for visit in (1, 3)], graph.copy()
+    placed = graph.poses()
+    graph.eliminate(2, 1)
+    assert [(f.visit_a, f.visit_b) for f in graph.factors] == [(0, 1), (0, 3), (1, 3)]
+    for visit, known in zip((1, 3), before, strict=True):
+        relative = graph.relative(0, visit)
+        # But for what is not linear.
+        assert np.abs(log(inverse(known.mean) @ relative.mean)).max() < 1e-3
+        assert relative.covariance[PLANE] == pytest.approx(
+            known.covariance[PLANE], rel=0.02, abs=1e-5
+        )
+    # It keeps its place beside its anchor, in the order of the visits, and does not come back.
+    assert graph.poses() == pytest.approx(placed, abs=1e-3)
+    assert graph.pose(2) == pytest.approx(graph.poses()[2], abs=1e-12)
+    graph.add_factor(Factor(3, 4, gaussian(planar_pose(1.0, 0.0, 0.0))))
+    assert len(graph.poses()) == 5
+    assert graph.visits == (0, 1, 2, 3, 4)
+    # A copy from before knows nothing of it.
+    assert len(other.factors) == 4
+    assert np.array_equal(other.poses(), placed)
+
+
+def test_traversals_that_are_eliminated_are_fused_into_one_arc() -> None:
+    # Out and back and out again between two areas, 0 and 1: Eq. (10).
+    motion, tie = gaussian(planar_pose(3.0, 0.0, 0.0)), gaussian(identity(), sigma_m=0.01)
+    graph = chain(motion, motion.inverse(), motion, motion.inverse(), motion)
+    for visit in (2, 3, 4, 5):
+        graph.add_factor(Factor(visit % 2, visit, tie))
+    before = graph.relative(0, 1)
+    for visit in (2, 3, 4):
+        graph.eliminate(visit, visit % 2)
+    assert [(f.visit_a, f.visit_b) for f in graph.factors] == [(0, 1), (0, 5), (1, 5)]
+    after = graph.relative(0, 1)
+    assert after.mean == pytest.approx(before.mean, abs=1e-4)
+    # What an alignment says is shared out: never surer than all together, and little less sure.
+    ratio = np.diag(after.covariance[PLANE]) / np.diag(before.covariance[PLANE])
+    assert np.all((ratio > 0.999) & (ratio < 1.3))
+
+
+def test_what_the_arcs_of_an_eliminated_visit_share_counts_once() -> None:
+    # Three areas know each other only by one visit that saw them all.
+    graph = chain(gaussian(planar_pose(50.0, 0.0, 0.0), sigma_m=30.0), gaussian(identity()))
+    graph.add_factor(Factor(2, 3, gaussian(identity())))
+    graph.add_factor(Factor(0, 3, gaussian(planar_pose(1.0, 0.0, 0.0))))
+    graph.add_factor(Factor(1, 3, gaussian(planar_pose(-1.0, 0.0, 0.0))))
+    before = graph.relative(0, 1).sigma_m
+    graph.eliminate(3, 0)
+    assert before <= graph.relative(0, 1).sigma_m < 2.0 * before
+
+
 def test_factors_come_in_the_order_of_their_visits() -> None:
     graph = chain(*[gaussian(planar_pose(1.0, 0.0, 0.0))] * 2)
     assert [(f.visit_a, f.visit_b) for f in graph.factors] == [(0, 1), (1, 2)]

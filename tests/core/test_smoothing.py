@@ -20,6 +20,7 @@ from hmt_service.core.graph import Factor, PoseGraph
 from hmt_service.core.hypotheses import Assignment, Hypothesis, Topology
 from hmt_service.core.smoothing import Smoother
 from hmt_service.core.submap import Visit, visit_of
+from hmt_service.core.visits import Visits
 from tests.core.factories import ROOM, keyframes_along, motion_covariance
 
 CONFIG = load_config(text="odometry: {window_keyframes: 3}")
@@ -55,7 +56,7 @@ def errors_m(poses: Sequence[Pose] | np.ndarray, path: Sequence[Pose]) -> np.nda
 
 def smoothed(visits: Sequence[Visit]) -> tuple[np.ndarray, np.ndarray]:
     """Return the poses before and after."""
-    hypothesis, known = hypothesis_of(visits), {visit.visit: visit for visit in visits}
+    hypothesis, known = hypothesis_of(visits), Visits(visits)
     return hypothesis.keyframe_poses(known), Smoother(CONFIG).smooth(hypothesis, known)
 
 
@@ -106,7 +107,7 @@ def test_a_visit_that_is_tied_by_its_alignment_alone_stays_where_that_says() -> 
     hypothesis = hypothesis_of([there, back])
     arc = Factor(1, 2, back.visit_from_keyframe[-1] @ lost)
     tied = hypothesis.extended(Assignment(2, 0, place), arc, hypothesis=1, log_weight=0.0)
-    known = {0: there, 1: back, 2: far}
+    known = Visits([there, back, far])
     after = Smoother(CONFIG).smooth(tied, known)
     assert not np.array_equal(after, tied.keyframe_poses(known))
     assert after[len(PATH)] == pytest.approx(place.mean, abs=0.01)
