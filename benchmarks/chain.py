@@ -9,6 +9,7 @@ References: own.
 from __future__ import annotations
 
 import sys
+import tempfile
 import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -129,40 +130,41 @@ def _map(readings: Iterable[Reading], result: Path, preset: Preset) -> None:
     """Map in this process, and leave what it did and cost in a file."""
     process, clock = psutil.Process(), StageClock(now_s=time.process_time)
     empty_bytes: list[float] = []
-    memory_bytes: list[float] = []
-    spent_s = []
-
     entered: set[float] = set()
-    areas: list[int] = []
 
     def enter(event: Event) -> None:
         if event.kind is EventKind.AREA_ENTERED:
             entered.add(event.numbers["area"])
 
-    def remember() -> None:
-        areas.append(len(entered))
-        memory_bytes.append(float(process.memory_info().rss))
-        spent_s.append(list(clock.spent_s.values()))
+    def row() -> FloatArray:
+        rss = float(process.memory_info().rss)
+        return np.array([float(len(entered)), rss, *clock.spent_s.values()])
 
     def measured() -> Iterator[Reading]:
         # Asked for the first time when all code is loaded, and there is no map yet.
         empty_bytes.append(float(process.memory_info().rss))
         yield from readings
 
-    with clock.running():
+    # What is measured is not kept in the memory that is measured.
+    with tempfile.TemporaryFile() as file, clock.running():
         engine, cost = map_readings(
-            measured(), load_config(preset), on_scan=remember, on_event=enter
+            measured(),
+            load_config(preset),
+            on_scan=lambda: file.write(row().tobytes()),
+            on_event=enter,
         )
-    spent_s.append(list(clock.spent_s.values()))
+        file.write(row().tobytes())
+        file.seek(0)
+        rows = np.frombuffer(file.read()).reshape(-1, len(row()))
     trajectory, snapshot = engine.trajectory(), engine.snapshot()
     best = None if snapshot is None else snapshot.posterior.hypotheses[0]
     np.savez(
         result,
         busy_s=cost.busy_s,
-        spent_s=np.array(spent_s),
+        spent_s=rows[:, 2:],
         empty_bytes=empty_bytes[0],
-        memory_bytes=np.array(memory_bytes),
-        areas=np.array(areas),
+        memory_bytes=rows[:-1, 1],
+        areas=rows[:-1, 0].astype(int),
         stamps_s=np.array([pose.stamp_s for pose in trajectory]),
         poses=np.array([pose.reference_from_body for pose in trajectory]),
         loop_closures=0 if best is None else best.loop_closures,
