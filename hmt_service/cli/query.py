@@ -1,4 +1,6 @@
-"""`hmt status`, `pose`, `posterior`, `areas`, `map`, `compare`: ask a daemon.
+"""`hmt status`, `pose`, `posterior`, `events`, `areas`, `map`, `compare`: ask a daemon.
+
+`posterior` and `events` also read what a run has saved.
 
 References: own.
 """
@@ -14,13 +16,20 @@ import typer
 
 from hmt_service.cli.connection import Connect, Json, Robot, Site, Timeout
 from hmt_service.core.geometry import GaussianPose, yaw_of
-from hmt_service.core.types import MapMethod
+from hmt_service.core.types import EventKind, MapMethod
 from hmt_service.service.keys import DEFAULT_ENDPOINT
+
+Run = Annotated[
+    Path | None,
+    typer.Argument(
+        metavar="[DIR]", help="What `hmt run` or a daemon has saved; a daemon if not given."
+    ),
+]
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from hmt_service.core.types import GlobalMap
+    from hmt_service.core.types import Belief, GlobalMap
     from hmt_service.service.client import HmtClient
     from hmt_service.service.reports import Status
 
@@ -67,13 +76,29 @@ def pose(
 
 
 def posterior(
+    run: Run = None,
     connect: Connect = DEFAULT_ENDPOINT,
     site: Site = "site",
     robot: Robot = "robot",
     timeout: Timeout = 10.0,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="Figure to draw, such as posterior.png: effective sample size and probabilities "
+            "of the areas over time."
+        ),
+    ] = None,
+    start: Annotated[float | None, typer.Option(help="Sensor time at its left, s.")] = None,
+    end: Annotated[float | None, typer.Option(help="Sensor time at its right, s.")] = None,
     as_json: Json = False,
 ) -> None:
-    """Show the topologies that the robot may have travelled, with their probabilities."""
+    """Show the topologies that the robot may have travelled, with their probabilities.
+
+    Of a saved run (DIR), and with --out: where it was believed to be, over time.
+    """
+    if run is not None or out is not None:
+        _show_history(_history(run, connect, site, robot, timeout), out, start, end, as_json)
+        return
     with _client(connect, site, robot, timeout) as client:
         answer = client.posterior()
     if _print_json(answer, is_wanted=as_json):
@@ -96,6 +121,44 @@ def posterior(
             ),
         )
     )
+
+
+def events(
+    run: Run = None,
+    connect: Connect = DEFAULT_ENDPOINT,
+    site: Site = "site",
+    robot: Robot = "robot",
+    timeout: Timeout = 10.0,
+    kind: Annotated[
+        list[EventKind] | None, typer.Option(help="Only events of this kind; may be repeated.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Show what was decided, with the numbers that caused it: the oldest first.
+
+    Of a daemon the latest ones; of a saved run (DIR) all.
+    """
+    if run is not None:
+        from hmt_service.io.audit_files import read_events
+        from hmt_service.service.results import EVENTS
+
+        answer = read_events(run / EVENTS)
+    else:
+        with _client(connect, site, robot, timeout) as client:
+            answer = client.events()
+    answer = tuple(event for event in answer if not kind or event.kind in kind)
+    if _print_json(answer, is_wanted=as_json):
+        return
+    rows = (
+        (
+            f"{event.stamp_s:.2f}",
+            event.kind,
+            event.message,
+            ", ".join(f"{name} {value:.4g}" for name, value in sorted(event.numbers.items())),
+        )
+        for event in answer
+    )
+    _print(_table(f"{len(answer)} events", ("stamp s", "kind", "what", "numbers"), rows))
 
 
 def areas(
@@ -196,6 +259,53 @@ def _client(connect: str, site: str, robot: str, timeout_s: float) -> HmtClient:
     from hmt_service.service.client import HmtClient
 
     return HmtClient(connect, site=site, robot=robot, timeout_s=timeout_s)
+
+
+def _history(
+    run: Path | None, connect: str, site: str, robot: str, timeout_s: float
+) -> tuple[Belief, ...]:
+    """Return what was believed over time, by a saved run or by a daemon."""
+    if run is None:
+        with _client(connect, site, robot, timeout_s) as client:
+            return client.history().beliefs
+    from hmt_service.io.audit_files import read_beliefs
+    from hmt_service.service.results import BELIEFS
+
+    return read_beliefs(run / BELIEFS)
+
+
+def _show_history(
+    beliefs: tuple[Belief, ...],
+    out: Path | None,
+    start_s: float | None,
+    end_s: float | None,
+    as_json: bool,
+) -> None:
+    first_s = -math.inf if start_s is None else start_s
+    last_s = math.inf if end_s is None else end_s
+    beliefs = tuple(belief for belief in beliefs if first_s <= belief.stamp_s <= last_s)
+    if out is not None:
+        from hmt_service.viz.posterior import draw_history
+
+        draw_history(beliefs, out)
+    elif not _print_json(beliefs, is_wanted=as_json):
+        _print(_history_table(beliefs))
+
+
+def _history_table(beliefs: tuple[Belief, ...]) -> Table:
+    rows = (
+        (
+            f"{belief.stamp_s:.2f}",
+            f"{belief.effective_sample_size:.2f}",
+            "  ".join(
+                f"{area}: {p:.3f}"
+                for area, p in sorted(belief.current_area.items(), key=lambda item: -item[1])
+            ),
+        )
+        for belief in beliefs
+    )
+    headings = ("stamp s", "effective sample size", "area: probability")
+    return _table("where the robot was believed to be, where that changed", headings, rows)
 
 
 def _draw(

@@ -15,8 +15,10 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from hmt_service.core import audit
 from hmt_service.core.alignment import Aligner
 from hmt_service.core.area_abstraction import overlap_of, partition
+from hmt_service.core.audit import Audit
 from hmt_service.core.composition import arcs_of, compose_shortest_paths, residual_m
 from hmt_service.core.config import Config
 from hmt_service.core.geometry import FloatArray, GaussianPose, Pose, inverse, log
@@ -41,9 +43,9 @@ from hmt_service.core.types import (
     NO_POINTS,
     ArcResidual,
     AreaDifference,
+    Belief,
     Comparison,
     Event,
-    EventKind,
     GlobalMap,
     Keyframe,
     MapMethod,
@@ -54,7 +56,6 @@ from hmt_service.core.types import (
     Snapshot,
     StampedPose,
     Tracking,
-    TrackingFailure,
 )
 from hmt_service.core.visits import Visits, share_new
 from hmt_service.errors import NotFound, Unavailable
@@ -85,6 +86,7 @@ class Engine:
             negligible_mass=config.particles.negligible_mass,
             rng=rng,
         )
+        self._audit = Audit()
         self._visits = Visits()
         self._motions: list[Factor] = []
         self._scans = ScanLog()
@@ -114,7 +116,8 @@ class Engine:
             return ()
         self._revision += 1
         self._observation.learn(keyframe)
-        return (*self._plausibility.check(keyframe), *self._map(keyframe, tracking.registration))
+        doubts = self._plausibility.check(keyframe)
+        return self._audited((*doubts, *self._map(keyframe, tracking.registration)))
 
     def _map(self, keyframe: Keyframe, registration: Registration | None) -> tuple[Event, ...]:
         """Add a keyframe to every hypothesis."""
@@ -122,7 +125,7 @@ class Engine:
             return self._begin(keyframe)
         extended = self._open.with_keyframe(keyframe)
         if keyframe.failure is not None:
-            lost = _lost(keyframe, keyframe.failure, registration)
+            lost = audit.lost(keyframe, keyframe.failure, registration)
             if not self._is_dead_reckoning(keyframe):
                 return (lost, *self._enter(extended, len(self._open.keyframes)))
             self._visits.put(extended)
@@ -173,7 +176,7 @@ class Engine:
             self._finished_revision = self._revision
         if is_urgent or not self._visits or self._smooth_poses() is not None:
             return ()
-        events = self._recognise(self._open, self._open.keyframes[-1].stamp_s)
+        events = self._audited(self._recognise(self._open, self._open.keyframes[-1].stamp_s))
         if events:
             self._revision += 1
             self._finished_revision = self._revision
@@ -200,7 +203,7 @@ class Engine:
         topology = Topology((Assignment(0, 0, None),))
         first = Hypothesis(self._new_identifier(), 0.0, topology, graph)
         self._particles.replace([first])
-        return (self._entered(keyframe.stamp_s),)
+        return (audit.entered(self._particles, keyframe.stamp_s),)
 
     def _enter(self, visit: Visit, first_of_new: int) -> tuple[Event, ...]:
         """Close the open visit at a border and expand every hypothesis over what lies beyond it."""
@@ -209,20 +212,15 @@ class Engine:
         self._unweigh(opened.keyframes)
         self._refine(closed)
         stamp_s = opened.keyframes[-1].stamp_s
-        merged = self._pruned(self._particles.merge(), stamp_s, "merged")
+        merged = audit.pruned(self._particles.merge(), stamp_s, "merged")
         recognised = (*merged, *self._forget(stamp_s), *self._recognise(closed, stamp_s))
         self._forget_visit(closed.visit - 1)
         arc = Factor(closed.visit, opened.visit, motion)
         self._motions.append(arc)
-        expanded = [
-            successor
-            for hypothesis in self._particles.hypotheses
-            for successor in self._expand(hypothesis, opened, arc)
-        ]
+        expanded, branched = self._expand(opened, arc, stamp_s)
         self._visits.put(opened)
-        pruned = self._pruned(self._particles.replace(expanded), stamp_s)
-        branched = self._branched(len(expanded), stamp_s)
-        return (*recognised, self._entered(stamp_s), *branched, *pruned)
+        pruned = audit.pruned(self._particles.replace(expanded), stamp_s)
+        return (*recognised, audit.entered(self._particles, stamp_s), *branched, *pruned)
 
     def _forget(self, stamp_s: float) -> tuple[Event, ...]:
         """Drop what nothing has spoken for since long, and accept what alone is left."""
@@ -231,50 +229,54 @@ class Engine:
             unlikely_mass=particles.unlikely_mass, patience=particles.patience_areas
         )
         if not dropped or len(self._particles.hypotheses) > 1:
-            return self._pruned(dropped, stamp_s)
-        best = self._particles.best
-        numbers = {"hypothesis": float(best.hypothesis), "areas": float(len(best.topology.areas))}
-        message = f"accepted hypothesis {best.hypothesis}: no other is left"
-        accepted = Event(EventKind.ACCEPTED, stamp_s, message, numbers)
-        return (*self._pruned(dropped, stamp_s), accepted)
+            return audit.pruned(dropped, stamp_s)
+        accepted = audit.accepted(self._particles.best, stamp_s)
+        return (*audit.pruned(dropped, stamp_s), accepted)
 
     def _recognise(self, visit: Visit, stamp_s: float) -> tuple[Event, ...]:
         """Branch over where else in the map what a finished visit has seen may be."""
         known = self._particles.hypotheses
-        recognising = [
-            hypothesis.recognising(
-                match.area,
-                match.area_from_visit,
-                is_same_area=match.overlap >= _SAME_AREA,
-                hypothesis=self._new_identifier(),
-                log_weight=hypothesis.log_weight + match.log_factor,
-            )
-            for hypothesis in known
-            for match in self._transition.recognitions(hypothesis, visit, self._visits)
-            if match.area is not None and match.area_from_visit is not None
-            if not any(
-                other.has_recognised(hypothesis, match.area, match.area_from_visit.mean)
-                for other in known
-            )
-        ]
+        recognising, branched = [], []
+        for hypothesis in known:
+            for match in self._transition.recognitions(hypothesis, visit, self._visits):
+                place = match.area_from_visit
+                if match.area is None or place is None:
+                    continue
+                if any(h.has_recognised(hypothesis, match.area, place.mean) for h in known):
+                    continue
+                child = hypothesis.recognising(
+                    match.area,
+                    place,
+                    is_same_area=match.overlap >= _SAME_AREA,
+                    hypothesis=self._new_identifier(),
+                    log_weight=hypothesis.log_weight + match.log_factor,
+                )
+                recognising.append(child)
+                branched.append(_branched(hypothesis, child, match, stamp_s))
         if not recognising:
             return ()
-        expanded = [*known, *recognising]
-        pruned = self._pruned(self._particles.replace(expanded), stamp_s)
-        return (*self._branched(len(expanded), stamp_s), *pruned)
+        pruned = self._particles.replace([*known, *recognising])
+        return (*branched, *audit.pruned(pruned, stamp_s))
 
-    def _expand(self, hypothesis: Hypothesis, visit: Visit, arc: Factor) -> list[Hypothesis]:
-        """Return one hypothesis per place that the visit may be to, Eq. (6)."""
-        successors = self._transition.successors(hypothesis, visit, arc, self._visits)
-        return [
-            hypothesis.extended(
-                _assignment(visit.visit, successor),
-                arc,
-                hypothesis=self._new_identifier(),
-                log_weight=hypothesis.log_weight + successor.log_factor,
-            )
-            for successor in successors
-        ]
+    def _expand(
+        self, visit: Visit, arc: Factor, stamp_s: float
+    ) -> tuple[list[Hypothesis], list[Event]]:
+        """Return one hypothesis per hypothesis and place that the visit may be to, Eq. (6)."""
+        expanded, branched = [], []
+        for hypothesis in self._particles.hypotheses:
+            successors = self._transition.successors(hypothesis, visit, arc, self._visits)
+            for successor in successors:
+                child = hypothesis.extended(
+                    _assignment(visit.visit, successor),
+                    arc,
+                    hypothesis=self._new_identifier(),
+                    log_weight=hypothesis.log_weight + successor.log_factor,
+                )
+                expanded.append(child)
+                # One successor is no branch: what was believed goes on.
+                if len(successors) > 1:
+                    branched.append(_branched(hypothesis, child, successor, stamp_s))
+        return expanded, branched
 
     def _weigh(self, keyframe: Keyframe) -> tuple[Event, ...]:
         """Multiply the weights by the predictive likelihood of a keyframe, Eq. (12)."""
@@ -283,7 +285,7 @@ class Engine:
         evidence = {h.hypothesis: self._evidence(h, keyframe) for h in self._particles.hypotheses}
         self._weighed[keyframe.index] = evidence
         dropped = self._particles.reweight(lambda h: evidence[h.hypothesis])
-        return self._pruned(dropped, keyframe.stamp_s)
+        return audit.pruned(dropped, keyframe.stamp_s)
 
     def _evidence(self, hypothesis: Hypothesis, keyframe: Keyframe) -> float:
         """Return what the latest keyframe says for a hypothesis, against the background."""
@@ -333,43 +335,20 @@ class Engine:
         self._next_hypothesis += 1
         return self._next_hypothesis - 1
 
-    # ------------------------------------------------------------------ what happened
-
-    def _entered(self, stamp_s: float) -> Event:
-        best = self._particles.best
-        numbers = {
-            "area": float(best.current.area),
-            "probability": float(self._particles.probabilities[0]),
-            "hypotheses": float(len(self._particles.hypotheses)),
-        }
-        kind = "known" if best.current.area_from_visit is not None else "new"
-        message = f"entered {kind} area {best.current.area}"
-        return Event(EventKind.AREA_ENTERED, stamp_s, message, numbers)
-
-    def _branched(self, expanded: int, stamp_s: float) -> tuple[Event, ...]:
-        if expanded == 1:
-            return ()
-        numbers = {
-            "successors": float(expanded),
-            "kept": float(len(self._particles.hypotheses)),
-            "effective_sample_size": self._particles.effective_sample_size,
-        }
-        return (Event(EventKind.BRANCHED, stamp_s, f"{expanded} successors", numbers),)
-
-    def _pruned(
-        self, dropped: tuple[Hypothesis, ...], stamp_s: float, verb: str = "dropped"
-    ) -> tuple[Event, ...]:
-        return tuple(
-            Event(
-                EventKind.PRUNED,
-                stamp_s,
-                f"{verb} hypothesis {h.hypothesis} in area {h.current.area}",
-                {"hypothesis": float(h.hypothesis), "log_weight": h.log_weight},
-            )
-            for h in dropped
-        )
-
     # ------------------------------------------------------------------ what readers may ask
+
+    def _audited(self, events: tuple[Event, ...]) -> tuple[Event, ...]:
+        """Keep what was decided, and what is believed since."""
+        particles = self._particles
+        stamp_s, ess = self._open.keyframes[-1].stamp_s, particles.effective_sample_size
+        self._audit.note(events)
+        self._audit.believe(Belief(stamp_s, particles.current_area(), ess))
+        return events
+
+    @property
+    def audit(self) -> Audit:
+        """What was decided and believed."""
+        return self._audit
 
     @property
     def warnings(self) -> tuple[Event, ...]:
@@ -392,17 +371,13 @@ class Engine:
             return None
         best, visit = self._particles.best, self._open
         summaries = self._particles.summaries()
-        marginal: dict[int, float] = {}
-        for summary in summaries:
-            area = summary.current_area
-            marginal[area] = marginal.get(area, 0.0) + summary.probability
         visit_from_keyframe = visit.visit_from_keyframe[-1]
         return Snapshot(
             posterior=Posterior(
                 stamp_s=visit.keyframes[-1].stamp_s,
                 revision=self._revision,
                 hypotheses=summaries,
-                current_area=marginal,
+                current_area=self._particles.current_area(),
                 effective_sample_size=self._particles.effective_sample_size,
             ),
             keyframe_index=visit.last_keyframe,
@@ -584,17 +559,14 @@ def _said_of(tracking: Tracking) -> list[str]:
     return said
 
 
-def _lost(keyframe: Keyframe, failure: TrackingFailure, registration: Registration | None) -> Event:
-    numbers = {
-        "keyframe": float(keyframe.index),
-        "sigma_m": keyframe.previous_from_body.sigma_m,
-        "sigma_rad": keyframe.previous_from_body.sigma_rad,
-    }
-    if registration is not None:
-        numbers["inlier_share"] = registration.inlier_share
-        numbers["correction_m"] = registration.correction_m
-    message = f"keyframe {keyframe.index} was not registered ({failure})"
-    return Event(EventKind.LOST, keyframe.stamp_s, message, numbers)
+def _branched(parent: Hypothesis, child: Hypothesis, successor: Successor, stamp_s: float) -> Event:
+    return audit.branched(
+        parent,
+        child,
+        overlap=successor.overlap,
+        log_factor=successor.log_factor,
+        stamp_s=stamp_s,
+    )
 
 
 def _assignment(visit: int, successor: Successor) -> Assignment:

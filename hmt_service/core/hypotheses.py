@@ -230,6 +230,14 @@ class ParticleLayer:
         """1 / sum of squared weights, in [1, H]."""
         return float(1.0 / np.sum(self.probabilities**2))
 
+    def current_area(self) -> dict[int, float]:
+        """Return the marginal probability of the robot's current area."""
+        marginal: dict[int, float] = {}
+        for hypothesis, probability in zip(self._hypotheses, self.probabilities, strict=True):
+            area = hypothesis.current.area
+            marginal[area] = marginal.get(area, 0.0) + float(probability)
+        return marginal
+
     def replace(self, hypotheses: Sequence[Hypothesis]) -> tuple[Hypothesis, ...]:
         """Take a new set, normalise it, drop what is negligible and resample down to the budget.
 

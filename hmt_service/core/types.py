@@ -183,6 +183,26 @@ class Posterior:
     """1 / sum of squared weights, in [1, number of hypotheses]."""
 
 
+@dataclass(frozen=True, slots=True)
+class Belief:
+    """What was believed of where the robot is, at one moment."""
+
+    stamp_s: float
+    """Sensor time."""
+    current_area: Mapping[int, float]
+    """Marginal probability of the robot's current area."""
+    effective_sample_size: float
+    """1 / sum of squared weights, in [1, number of hypotheses]."""
+
+
+@dataclass(frozen=True, slots=True)
+class History:
+    """What was believed over time: where that changed, just before and just after."""
+
+    beliefs: tuple[Belief, ...]
+    """In time order."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class HmtPose:
     """Where the robot is: an area and a pose inside it, and the same in the reference frame."""

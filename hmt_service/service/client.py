@@ -17,6 +17,7 @@ from hmt_service.core.types import (
     Comparison,
     Event,
     GlobalMap,
+    History,
     HmtPose,
     MapMethod,
     OdometryReading,
@@ -91,6 +92,10 @@ class HmtClient:
     def events(self) -> tuple[Event, ...]:
         """Return the latest events, the oldest first."""
         return self._call(self._keys.call(Call.EVENTS), tuple)
+
+    def history(self) -> History:
+        """Return what was believed of where the robot is, over time."""
+        return self._call(self._keys.call(Call.HISTORY), History)
 
     def map(
         self,

@@ -19,10 +19,12 @@ from hmt_service.core.types import (
     Arc,
     ArcResidual,
     AreaDifference,
+    Belief,
     Comparison,
     Event,
     EventKind,
     GlobalMap,
+    History,
     HmtPose,
     HypothesisSummary,
     MapMethod,
@@ -71,7 +73,17 @@ def encoding_of(message: type[Message]) -> str:
     return PREFIX + message.DESCRIPTOR.full_name
 
 
-Value = HmtPose | Posterior | GlobalMap | Comparison | Event | tuple[Event, ...] | Status | Ack
+Value = (
+    HmtPose
+    | Posterior
+    | History
+    | GlobalMap
+    | Comparison
+    | Event
+    | tuple[Event, ...]
+    | Status
+    | Ack
+)
 """What the daemon publishes and answers."""
 
 
@@ -96,31 +108,9 @@ def decode(payload: bytes, encoding: str) -> Value | HmtError:
 
 
 def _message_of(value: Value | HmtError) -> Message:
-    match value:
-        case HmtPose():
-            return _pose_to_proto(value)
-        case Posterior():
-            return _posterior_to_proto(value)
-        case GlobalMap():
-            return _map_to_proto(value)
-        case Comparison():
-            return _comparison_to_proto(value)
-        case Event():
-            return _event_to_proto(value)
-        case tuple():
-            return pb.Events(events=map(_event_to_proto, value))
-        case Status():
-            return _status_to_proto(value)
-        case Ack():
-            return pb.Ack(
-                received=value.received,
-                accepted=value.accepted,
-                refused=value.refused,
-                processed_scans=value.processed_scans,
-                files=value.files,
-            )
-        case HmtError():
-            return pb.Error(code=f"ERROR_CODE_{value.code}", message=str(value))
+    if isinstance(value, HmtError):
+        return pb.Error(code=f"ERROR_CODE_{value.code}", message=str(value))
+    return _ENCODERS[type(value)](value)
 
 
 def _gaussian_to_proto(pose: GaussianPose) -> pb.GaussianPose:
@@ -179,6 +169,22 @@ def _posterior_to_proto(posterior: Posterior) -> pb.Posterior:
         ],
         current_area=dict(posterior.current_area),
         effective_sample_size=posterior.effective_sample_size,
+    )
+
+
+def _belief_to_proto(belief: Belief) -> pb.Belief:
+    return pb.Belief(
+        stamp_s=belief.stamp_s,
+        current_area=dict(belief.current_area),
+        effective_sample_size=belief.effective_sample_size,
+    )
+
+
+def _belief(message: pb.Belief) -> Belief:
+    return Belief(
+        stamp_s=message.stamp_s,
+        current_area=dict(message.current_area),
+        effective_sample_size=message.effective_sample_size,
     )
 
 
@@ -425,6 +431,23 @@ def _enum(enum: type[E_], name: str, prefix: str) -> E_:
         raise InvalidInput(f"{name} is not known here: the daemon is of another version") from error
 
 
+_ENCODERS: dict[type, Callable[[Any], Message]] = {
+    HmtPose: _pose_to_proto,
+    Posterior: _posterior_to_proto,
+    History: lambda history: pb.History(beliefs=map(_belief_to_proto, history.beliefs)),
+    GlobalMap: _map_to_proto,
+    Comparison: _comparison_to_proto,
+    Event: _event_to_proto,
+    tuple: lambda events: pb.Events(events=map(_event_to_proto, events)),
+    Status: _status_to_proto,
+    Ack: lambda ack: pb.Ack(
+        received=ack.received,
+        accepted=ack.accepted,
+        refused=ack.refused,
+        processed_scans=ack.processed_scans,
+        files=ack.files,
+    ),
+}
 _DECODERS: dict[str, tuple[type[Message], Callable[[Any], Value | HmtError]]] = {
     encoding_of(message): (message, from_proto)
     for message, from_proto in (
@@ -434,6 +457,7 @@ _DECODERS: dict[str, tuple[type[Message], Callable[[Any], Value | HmtError]]] = 
         (pb.Comparison, _comparison),
         (pb.Event, _event),
         (pb.Events, lambda message: tuple(map(_event, message.events))),
+        (pb.History, lambda message: History(tuple(map(_belief, message.beliefs)))),
         (pb.Status, _status),
         (pb.Ack, _ack),
         (pb.Error, _error),

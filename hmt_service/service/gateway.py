@@ -13,14 +13,15 @@ import logging
 import os
 import threading
 import time
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Iterable
 
 import zenoh
 
 from hmt_service import __version__
+from hmt_service.core.audit import Audit, belief_of
 from hmt_service.core.config import Config
-from hmt_service.core.types import Event, EventKind, MapMethod, Snapshot, Tracking
+from hmt_service.core.types import Event, EventKind, History, MapMethod, Snapshot, Tracking
 from hmt_service.errors import DaemonFailure, HmtError, Unavailable
 from hmt_service.runtime.localization import Localizer
 from hmt_service.runtime.messages import (
@@ -45,6 +46,7 @@ from hmt_service.service.reports import Ack, DaemonState, Status
 
 _LOG = logging.getLogger(__name__)
 _KEPT_EVENTS = 1000
+_KEPT_BELIEFS = 20_000
 _ANSWER_S = 8.0
 """Longest time for a slow call: less than clients wait, so that they learn the reason."""
 _REPORT_S = 1.0
@@ -83,7 +85,7 @@ class Gateway:
         self._localizer = Localizer()
         self._snapshot: Snapshot | None = None
         self._report = RunReport(0, 0.0, 0.0)
-        self._events: deque[Event] = deque(maxlen=_KEPT_EVENTS)
+        self._audit = Audit(events=_KEPT_EVENTS, beliefs=_KEPT_BELIEFS)
         self._lock = threading.Lock()
         self._is_stopping = False
         self._finishes = 0
@@ -171,7 +173,7 @@ class Gateway:
         for event in events:
             level = logging.WARNING if event.kind is EventKind.PRESET_DOUBTED else logging.INFO
             _LOG.log(level, "%s: %s", event.kind, event.message)
-            self._events.append(event)
+            self._audit.note([event])
             self._put(Topic.EVENT, event)
 
     def status(self) -> Status:
@@ -205,6 +207,7 @@ class Gateway:
         if mapped.snapshot is not None:
             self._snapshot = mapped.snapshot
             self._localizer.update(mapped.snapshot)
+            self._audit.believe(belief_of(mapped.snapshot.posterior))
             self._put(Topic.POSTERIOR, mapped.snapshot.posterior)
         self.publish(mapped.events)
         if mapped.finished is not None:
@@ -307,7 +310,9 @@ class Gateway:
             case Call.STATUS:
                 return self.status()
             case Call.EVENTS:
-                return tuple(self._events)
+                return self._audit.events
+            case Call.HISTORY:
+                return History(self._audit.beliefs)
             case Call.POSE if self._localizer.pose is not None:
                 return self._localizer.pose
             case Call.POSTERIOR if self._snapshot is not None:

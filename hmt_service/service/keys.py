@@ -50,6 +50,7 @@ class Call(StrEnum):
     POSE = "pose"
     POSTERIOR = "posterior"
     EVENTS = "events"
+    HISTORY = "history"
     MAP = "map"
     AREAS = "areas"
     COMPARE = "compare"

@@ -21,13 +21,14 @@ if TYPE_CHECKING:
     from hmt_service.core.engine import Engine
 
 TRAJECTORY, MAP, SUMMARY = "trajectory.tum", "map.hmt", "summary.json"
+EVENTS, BELIEFS = "events.jsonl", "posterior.jsonl"
 """Names of the files."""
 
 
 def save_results(
     engine: Engine, report: RunReport, *, directory: Path, config: Config, seed: int
 ) -> tuple[str, ...]:
-    """Write trajectory, map and summary, each replaced as a whole.
+    """Write trajectory, map, events, beliefs and summary, each replaced as a whole.
 
     Args:
         engine: What was built.
@@ -42,6 +43,7 @@ def save_results(
     Raises:
         Unavailable: If there is no map yet.
     """
+    from hmt_service.io.audit_files import write_beliefs, write_events
     from hmt_service.io.map_file import write_map
     from hmt_service.io.trajectory import write_tum
 
@@ -75,9 +77,12 @@ def save_results(
     trajectory = engine.trajectory()
     _replace(directory / TRAJECTORY, lambda path: write_tum(path, trajectory))
     write_map(directory / MAP, engine.stored())
+    audit = engine.audit
+    _replace(directory / EVENTS, lambda path: write_events(path, audit.events))
+    _replace(directory / BELIEFS, lambda path: write_beliefs(path, audit.beliefs))
     text = json.dumps(summary, indent=2) + "\n"
     _replace(directory / SUMMARY, lambda path: path.write_text(text))
-    return TRAJECTORY, MAP, SUMMARY
+    return TRAJECTORY, MAP, EVENTS, BELIEFS, SUMMARY
 
 
 def _replace(path: Path, write: Callable[[Path], object]) -> None:

@@ -57,11 +57,7 @@ def draw_maps(maps: Sequence[GlobalMap], comparison: Comparison | None, path: Pa
         InvalidInput: If there is no map, one without areas, or no such image format.
         NotFound: If the folder of the image does not exist.
     """
-    formats = FigureCanvasAgg.get_supported_filetypes()
-    if path.suffix.lower().lstrip(".") not in formats:
-        raise InvalidInput(f"image {path.name} in none of the formats {', '.join(sorted(formats))}")
-    if not path.parent.is_dir():
-        raise NotFound(f"folder {path.parent} of the image {path.name} does not exist")
+    check_image(path)
     if not maps or not all(each.areas for each in maps):
         raise InvalidInput(f"{len(maps)} maps with {[len(m.areas) for m in maps]} areas to draw")
     colours = area_colours(maps)
@@ -88,6 +84,20 @@ def draw_maps(maps: Sequence[GlobalMap], comparison: Comparison | None, path: Pa
         frameon=False,
     )
     figure.savefig(path, dpi=150)
+
+
+def check_image(path: Path) -> None:
+    """Check that an image can be written there.
+
+    Raises:
+        InvalidInput: If there is no such image format.
+        NotFound: If the folder of the image does not exist.
+    """
+    formats = FigureCanvasAgg.get_supported_filetypes()
+    if path.suffix.lower().lstrip(".") not in formats:
+        raise InvalidInput(f"image {path.name} in none of the formats {', '.join(sorted(formats))}")
+    if not path.parent.is_dir():
+        raise NotFound(f"folder {path.parent} of the image {path.name} does not exist")
 
 
 def position_ellipse(reference_from_area: GaussianPose) -> tuple[float, float, float]:

@@ -12,6 +12,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from hmt_service.cli.app import app
+from hmt_service.cli.plain import to_json
 from hmt_service.core.config import load_config
 from hmt_service.core.engine import Engine
 from hmt_service.core.odometry import Odometry
@@ -19,6 +20,7 @@ from hmt_service.errors import NotFound, Unavailable
 from hmt_service.io.logs import read_log
 from hmt_service.io.mcap_log import McapWriter
 from hmt_service.io.trajectory import read_tum
+from hmt_service.service.client import HmtClient
 from hmt_service.service.local import free_endpoint
 from tests.flat import SETTINGS, path, ranges_from, readings
 from tests.service.harness import RunningDaemon, as_received, running_daemon
@@ -101,6 +103,34 @@ def test_posterior_shows_hypotheses_whose_probabilities_sum_to_one(daemon: Runni
     answer = json.loads(shown(daemon, "posterior", "--json"))
     assert sum(h["probability"] for h in answer["hypotheses"]) == pytest.approx(1.0)
     assert "loop closures" in shown(daemon, "posterior")
+
+
+def test_posterior_over_time_is_shown_and_drawn(daemon: RunningDaemon, tmp_path: Path) -> None:
+    path = tmp_path / "posterior.png"
+    assert shown(daemon, "posterior", "--out", str(path)) == ""
+    assert path.read_bytes().startswith(b"\x89PNG")
+    saved = json.loads(shown(daemon, "posterior", str(daemon.out), "--json"))
+    with HmtClient(daemon.endpoint) as client:
+        live = client.history().beliefs
+    assert json.loads(to_json(live)) == saved
+    assert all(sum(belief["current_area"].values()) == pytest.approx(1.0) for belief in saved)
+
+
+def test_events_are_those_that_the_run_has_saved(daemon: RunningDaemon) -> None:
+    live, saved = (
+        json.loads(shown(daemon, "events", *where, "--kind", "area_entered", "--json"))
+        for where in ((), (str(daemon.out),))
+    )
+    assert live == saved
+    assert all(event["numbers"]["hypotheses"] >= 1.0 for event in live)
+    assert "effective_sample_size" in shown(daemon, "events")
+
+
+def test_a_folder_without_events_is_not_found(tmp_path: Path) -> None:
+    for command in ("events", "posterior"):
+        result = CliRunner().invoke(app, [command, str(tmp_path)])
+        assert result.exit_code != 0
+        assert "cannot be read" in str(result.exception)
 
 
 def test_areas_map_and_compare_show_every_area(daemon: RunningDaemon) -> None:

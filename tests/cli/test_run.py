@@ -70,7 +70,7 @@ def test_run_reports_malformed_lines_by_number(log: Path, tmp_path: Path) -> Non
 def test_same_log_and_seed_give_the_same_bytes(log: Path, tmp_path: Path) -> None:
     for name in ("first", "second"):
         run(log, tmp_path / name, "--seed", "7")
-    for file in ("trajectory.tum", "map.hmt"):
+    for file in ("trajectory.tum", "map.hmt", "events.jsonl", "posterior.jsonl"):
         first, second = ((tmp_path / name / file).read_bytes() for name in ("first", "second"))
         assert first == second
 

@@ -14,10 +14,12 @@ from hmt_service.core.types import (
     Arc,
     ArcResidual,
     AreaDifference,
+    Belief,
     Comparison,
     Event,
     EventKind,
     GlobalMap,
+    History,
     HmtPose,
     HypothesisSummary,
     MapMethod,
@@ -64,6 +66,9 @@ posteriors = st.builds(
     st.dictionaries(ids, shares, max_size=4),
     reals,
 )
+histories = st.lists(
+    st.builds(Belief, reals, st.dictionaries(ids, shares, max_size=4), reals), max_size=3
+).map(lambda beliefs: History(tuple(beliefs)))
 clouds = st.lists(st.tuples(*[st.floats(-1e4, 1e4, width=32)] * 3), max_size=4).map(
     lambda rows: np.array(rows, dtype=np.float32).reshape(-1, 3)
 )
@@ -132,7 +137,7 @@ def assert_same(mine: object, theirs: object) -> None:
         assert mine == theirs
 
 
-@given(poses | posteriors | maps | comparisons | events | statuses | acks)
+@given(poses | posteriors | histories | maps | comparisons | events | statuses | acks)
 def test_values_come_back_as_they_were(value: Value) -> None:
     message = encode(value)
     assert_same(decode(message.payload, message.encoding), value)

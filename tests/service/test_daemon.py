@@ -41,7 +41,13 @@ def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningDaemon]:
             ack = client.finish()
             assert (ack.received, ack.accepted, ack.refused) == (2 * SCANS, 2 * SCANS, 0)
             assert ack.processed_scans == SCANS
-            assert ack.files == ("trajectory.tum", "map.hmt", "summary.json")
+            assert ack.files == (
+                "trajectory.tum",
+                "map.hmt",
+                "events.jsonl",
+                "posterior.jsonl",
+                "summary.json",
+            )
         yield daemon
 
 

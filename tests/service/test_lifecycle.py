@@ -32,7 +32,7 @@ from hmt_service.service.session import Endpoints, Mode, open_session
 from tests.flat import readings
 from tests.service.harness import RunningDaemon, running_daemon, wait_until
 
-FILES = ["map.hmt", "summary.json", "trajectory.tum"]
+FILES = ["events.jsonl", "map.hmt", "posterior.jsonl", "summary.json", "trajectory.tum"]
 SURPLUS = 3000
 """Scans that take longer than the daemon has for them when it is told to stop."""
 

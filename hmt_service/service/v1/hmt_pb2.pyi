@@ -251,6 +251,29 @@ class Events(_message.Message):
     events: _containers.RepeatedCompositeFieldContainer[Event]
     def __init__(self, events: _Optional[_Iterable[_Union[Event, _Mapping]]] = ...) -> None: ...
 
+class Belief(_message.Message):
+    __slots__ = ("stamp_s", "current_area", "effective_sample_size")
+    class CurrentAreaEntry(_message.Message):
+        __slots__ = ("key", "value")
+        KEY_FIELD_NUMBER: _ClassVar[int]
+        VALUE_FIELD_NUMBER: _ClassVar[int]
+        key: int
+        value: float
+        def __init__(self, key: _Optional[int] = ..., value: _Optional[float] = ...) -> None: ...
+    STAMP_S_FIELD_NUMBER: _ClassVar[int]
+    CURRENT_AREA_FIELD_NUMBER: _ClassVar[int]
+    EFFECTIVE_SAMPLE_SIZE_FIELD_NUMBER: _ClassVar[int]
+    stamp_s: float
+    current_area: _containers.ScalarMap[int, float]
+    effective_sample_size: float
+    def __init__(self, stamp_s: _Optional[float] = ..., current_area: _Optional[_Mapping[int, float]] = ..., effective_sample_size: _Optional[float] = ...) -> None: ...
+
+class History(_message.Message):
+    __slots__ = ("beliefs",)
+    BELIEFS_FIELD_NUMBER: _ClassVar[int]
+    beliefs: _containers.RepeatedCompositeFieldContainer[Belief]
+    def __init__(self, beliefs: _Optional[_Iterable[_Union[Belief, _Mapping]]] = ...) -> None: ...
+
 class ProcessStatus(_message.Message):
     __slots__ = ("name", "pid", "is_ready", "backlog", "processed", "busy_s")
     NAME_FIELD_NUMBER: _ClassVar[int]

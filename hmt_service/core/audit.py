@@ -1,0 +1,167 @@
+"""The audit: what was decided and what was believed, when, and for which reasons.
+
+References:
+    Blanco et al. 2008, Fig. 10 (effective sample size and current-area marginal over time).
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hmt_service.core.types import (
+    Belief,
+    Event,
+    EventKind,
+    Keyframe,
+    Posterior,
+    Registration,
+    TrackingFailure,
+)
+
+if TYPE_CHECKING:
+    from hmt_service.core.hypotheses import Hypothesis, ParticleLayer
+
+# Beliefs that differ by no more than this are one that lasts.
+_EQUAL = 1e-6
+
+
+class Audit:
+    """The latest events and beliefs, the oldest first; what is older than many is dropped."""
+
+    def __init__(self, *, events: int = 10_000, beliefs: int = 50_000) -> None:
+        """Start empty.
+
+        Args:
+            events: Most events kept.
+            beliefs: Most beliefs kept; one that lasts takes two.
+        """
+        self._events: deque[Event] = deque(maxlen=events)
+        self._beliefs: deque[Belief] = deque(maxlen=beliefs)
+
+    @property
+    def events(self) -> tuple[Event, ...]:
+        """What was decided."""
+        return tuple(self._events)
+
+    @property
+    def beliefs(self) -> tuple[Belief, ...]:
+        """What was believed: where that changed, just before and just after."""
+        return tuple(self._beliefs)
+
+    def note(self, events: Iterable[Event]) -> None:
+        """Take what has been decided."""
+        self._events.extend(events)
+
+    def believe(self, belief: Belief) -> None:
+        """Take what is believed now."""
+        before = self._beliefs
+        if len(before) > 1 and _is_same(before[-1], belief) and _is_same(before[-2], belief):
+            before.pop()
+        before.append(belief)
+
+
+def belief_of(posterior: Posterior) -> Belief:
+    """Return what a posterior says of where the robot is."""
+    return Belief(posterior.stamp_s, posterior.current_area, posterior.effective_sample_size)
+
+
+def _is_same(first: Belief, second: Belief) -> bool:
+    if first.current_area.keys() != second.current_area.keys():
+        return False
+    gaps = [abs(p - second.current_area[area]) for area, p in first.current_area.items()]
+    gap = first.effective_sample_size - second.effective_sample_size
+    return max(gaps, default=0.0) <= _EQUAL and abs(gap) <= _EQUAL
+
+
+# ---------------------------------------------------------------------- what events say
+
+
+def entered(particles: ParticleLayer, stamp_s: float) -> Event:
+    """Return that the robot has entered an area, says the best hypothesis."""
+    best = particles.best
+    numbers = {
+        "area": float(best.current.area),
+        "probability": float(particles.probabilities[0]),
+        "hypotheses": float(len(particles.hypotheses)),
+        "effective_sample_size": particles.effective_sample_size,
+    }
+    kind = "known" if best.current.area_from_visit is not None else "new"
+    return Event(
+        EventKind.AREA_ENTERED, stamp_s, f"entered {kind} area {best.current.area}", numbers
+    )
+
+
+def branched(
+    parent: Hypothesis, child: Hypothesis, *, overlap: float, log_factor: float, stamp_s: float
+) -> Event:
+    """Return that one hypothesis has become another: where it says that the robot is, and why.
+
+    Args:
+        parent: What was believed before.
+        child: What may be believed since.
+        overlap: Share of what was seen that the area explains.
+        log_factor: Log of the probability of being there times that of what was seen.
+        stamp_s: Sensor time.
+    """
+    current = child.current
+    place = "a new area" if current.area_from_visit is None else f"area {current.area} again"
+    if current.area_from_visit is None and overlap > 0.0:
+        place = "a new area that sees a known one"
+    numbers = {
+        "hypothesis": float(child.hypothesis),
+        "parent": float(parent.hypothesis),
+        "area": float(current.area),
+        "overlap": overlap,
+        "log_factor": log_factor,
+        "parent_probability": float(np.exp(parent.log_weight)),
+    }
+    message = (
+        f"hypothesis {child.hypothesis} from {parent.hypothesis}: {place}, "
+        f"overlap {overlap:.2f}, log factor {log_factor:.1f}"
+    )
+    return Event(EventKind.BRANCHED, stamp_s, message, numbers)
+
+
+def pruned(
+    dropped: Iterable[Hypothesis], stamp_s: float, verb: str = "dropped"
+) -> tuple[Event, ...]:
+    """Return that hypotheses are no longer followed."""
+    return tuple(
+        Event(
+            EventKind.PRUNED,
+            stamp_s,
+            f"{verb} hypothesis {h.hypothesis} in area {h.current.area}, "
+            f"probability {np.exp(h.log_weight):.2g}",
+            {
+                "hypothesis": float(h.hypothesis),
+                "area": float(h.current.area),
+                "log_weight": h.log_weight,
+            },
+        )
+        for h in dropped
+    )
+
+
+def accepted(best: Hypothesis, stamp_s: float) -> Event:
+    """Return that only one hypothesis is left."""
+    numbers = {"hypothesis": float(best.hypothesis), "areas": float(len(best.topology.areas))}
+    message = f"accepted hypothesis {best.hypothesis}: no other is left"
+    return Event(EventKind.ACCEPTED, stamp_s, message, numbers)
+
+
+def lost(keyframe: Keyframe, failure: TrackingFailure, registration: Registration | None) -> Event:
+    """Return that a keyframe was not registered."""
+    numbers = {
+        "keyframe": float(keyframe.index),
+        "sigma_m": keyframe.previous_from_body.sigma_m,
+        "sigma_rad": keyframe.previous_from_body.sigma_rad,
+    }
+    if registration is not None:
+        numbers["inlier_share"] = registration.inlier_share
+        numbers["correction_m"] = registration.correction_m
+    message = f"keyframe {keyframe.index} was not registered ({failure})"
+    return Event(EventKind.LOST, keyframe.stamp_s, message, numbers)

@@ -1,0 +1,74 @@
+"""The audit: what lasts is kept once, what is old is dropped, and events say why."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hmt_service.core.audit import Audit
+from hmt_service.core.config import load_config
+from hmt_service.core.engine import Engine
+from hmt_service.core.odometry import Odometry
+from hmt_service.core.types import Belief, Event, EventKind
+from tests.core.factories import RING, drifting, drive, ring_path
+
+
+def belief(stamp_s: float, **areas: float) -> Belief:
+    masses = {int(name[1:]): mass for name, mass in areas.items()}
+    return Belief(stamp_s, masses, 1.0 / sum(mass**2 for mass in masses.values()))
+
+
+def test_a_belief_that_lasts_is_kept_at_both_ends() -> None:
+    audit = Audit()
+    for stamp_s in range(5):
+        audit.believe(belief(float(stamp_s), a0=1.0))
+    for stamp_s in range(5, 8):
+        audit.believe(belief(float(stamp_s), a0=0.4, a1=0.6))
+    audit.believe(belief(8.0, a1=1.0))
+    assert [b.stamp_s for b in audit.beliefs] == [0.0, 4.0, 5.0, 7.0, 8.0]
+
+
+def test_what_is_older_than_many_is_dropped() -> None:
+    audit = Audit(events=3, beliefs=2)
+    for stamp_s in range(5):
+        audit.note([Event(EventKind.LOST, float(stamp_s), "lost")])
+        audit.believe(belief(float(stamp_s), **{f"a{stamp_s}": 1.0}))
+    assert [event.stamp_s for event in audit.events] == [2.0, 3.0, 4.0]
+    assert [b.stamp_s for b in audit.beliefs] == [3.0, 4.0]
+
+
+@pytest.fixture(scope="module")
+def engine() -> Engine:
+    path = ring_path(laps=1.4)
+    odometry = drifting(path, scale=1.02, turn_rad_per_m=0.004)
+    metric, engine = Odometry(load_config()), Engine(load_config())
+    for reading in drive(RING, path, odometry=odometry, noise=np.random.default_rng(0)):
+        if (tracking := metric.process(reading)) is not None:
+            engine.process(tracking)
+    engine.finish()
+    return engine
+
+
+def test_every_hypothesis_has_an_origin_and_every_dropped_one_a_mass(engine: Engine) -> None:
+    events = engine.audit.events
+    born = {e.numbers["hypothesis"]: e for e in events if e.kind is EventKind.BRANCHED}
+    dropped = [e for e in events if e.kind is EventKind.PRUNED]
+    assert born
+    assert dropped
+    for event in born.values():
+        assert {"parent", "area", "overlap", "log_factor"} <= event.numbers.keys()
+        assert np.isfinite(event.numbers["log_factor"])
+    # Branches of one parent: the one that is kept explains what was seen better.
+    assert any(event.numbers["overlap"] > 0.45 for event in born.values())
+    for event in dropped:
+        assert event.numbers["log_weight"] <= 0.0
+
+
+def test_beliefs_end_with_the_posterior(engine: Engine) -> None:
+    snapshot = engine.snapshot()
+    assert snapshot is not None
+    last = engine.audit.beliefs[-1]
+    assert last.stamp_s == snapshot.posterior.stamp_s
+    assert last.current_area == snapshot.posterior.current_area
+    assert last.effective_sample_size == snapshot.posterior.effective_sample_size
+    assert all(sum(b.current_area.values()) == pytest.approx(1.0) for b in engine.audit.beliefs)
