@@ -41,7 +41,7 @@ from hmt_service.core.visits import Visits
 # Keyframes look at the same when the middles of what they see are so near.
 _NEAR_M = 4.0
 # Each is tied to so many other times at most, and to a window of so many keyframes to either side.
-_MOST_TIMES, _WINDOW = 3, 4
+_MOST_TIMES, _WINDOW = 2, 4
 # Windows begin at every third keyframe: neighbours share one.
 _STRIDE = 3
 # What the consistent poses are off at most; a tie that says more is a wrong one.

@@ -19,6 +19,7 @@ from hmt_service.viz.figures import check_image
 
 _MOST_AREAS = 8
 """Panels: of the areas that were most in doubt."""
+_LEAST_DOUBT = 0.01
 _INK, _FILL = "#202020", "#0072B2"
 _PANEL_IN, _WIDTH_IN = 1.1, 10.0
 
@@ -64,13 +65,15 @@ def doubted_areas(beliefs: Sequence[Belief]) -> list[int]:
     Where nothing was in doubt, those that the robot was in longest.
     """
     doubt: dict[int, float] = {}
+    peak: dict[int, float] = {}
     stay: dict[int, float] = {}
     stamps_s = [belief.stamp_s for belief in beliefs]
     for belief, end_s in zip(beliefs, [*stamps_s[1:], stamps_s[-1]], strict=True):
         lasted_s = end_s - belief.stamp_s
         for area, p in belief.current_area.items():
             doubt[area] = doubt.get(area, 0.0) + lasted_s * min(p, 1.0 - p)
+            peak[area] = max(peak.get(area, 0.0), min(p, 1.0 - p))
             stay[area] = stay.get(area, 0.0) + lasted_s * p
     order = sorted(doubt, key=lambda area: (-doubt[area], -stay[area], area))
-    in_doubt = [area for area in order if doubt[area] > 0.0]
+    in_doubt = [area for area in order if peak[area] >= _LEAST_DOUBT]
     return sorted((in_doubt or order)[:_MOST_AREAS])
