@@ -281,9 +281,11 @@ def _show_history(
     end_s: float | None,
     as_json: bool,
 ) -> None:
+    from hmt_service.core.audit import between
+
     first_s = -math.inf if start_s is None else start_s
     last_s = math.inf if end_s is None else end_s
-    beliefs = tuple(belief for belief in beliefs if first_s <= belief.stamp_s <= last_s)
+    beliefs = between(beliefs, first_s, last_s)
     if out is not None:
         from hmt_service.viz.posterior import draw_history
 

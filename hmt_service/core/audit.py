@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -67,6 +68,27 @@ class Audit:
 def belief_of(posterior: Posterior) -> Belief:
     """Return what a posterior says of where the robot is."""
     return Belief(posterior.stamp_s, posterior.current_area, posterior.effective_sample_size)
+
+
+def between(beliefs: Iterable[Belief], start_s: float, end_s: float) -> tuple[Belief, ...]:
+    """Return what was believed in an interval: what held at its ends is put there."""
+    chosen: list[Belief] = []
+    held: Belief | None = None
+    for belief in beliefs:
+        if belief.stamp_s > end_s:
+            break
+        if belief.stamp_s >= start_s:
+            if held is not None and not chosen and belief.stamp_s > start_s:
+                chosen.append(replace(held, stamp_s=start_s))
+            chosen.append(belief)
+        held = belief
+    else:
+        return tuple(chosen)
+    if held is not None:
+        if not chosen:
+            chosen.append(replace(held, stamp_s=start_s))
+        chosen.append(replace(held, stamp_s=end_s))
+    return tuple(chosen)
 
 
 def _is_same(first: Belief, second: Belief) -> bool:

@@ -266,15 +266,16 @@ class Engine:
         for hypothesis in self._particles.hypotheses:
             successors = self._transition.successors(hypothesis, visit, arc, self._visits)
             for successor in successors:
+                # One successor is no branch: what was believed goes on.
+                is_branch = len(successors) > 1
                 child = hypothesis.extended(
                     _assignment(visit.visit, successor),
                     arc,
-                    hypothesis=self._new_identifier(),
+                    hypothesis=self._new_identifier() if is_branch else hypothesis.hypothesis,
                     log_weight=hypothesis.log_weight + successor.log_factor,
                 )
                 expanded.append(child)
-                # One successor is no branch: what was believed goes on.
-                if len(successors) > 1:
+                if is_branch:
                     branched.append(_branched(hypothesis, child, successor, stamp_s))
         return expanded, branched
 

@@ -15,7 +15,7 @@ from __future__ import annotations
 import weakref
 from collections.abc import Callable, Iterable, Mapping
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import gtsam
 import numpy as np
@@ -332,10 +332,10 @@ class PoseGraph:
     def _fuse(self, factor: Factor) -> None:
         """Add an arc to what is known of the same two visits by other observations."""
         key = _key(factor.visit_a, factor.visit_b)
+        a_from_b = _between(factor, key[0])
         if key in self._factors:
-            known = _between(self._factors[key], factor.visit_a)
-            factor = replace(factor, a_from_b=known.fuse(factor.a_from_b))
-        self.add_factor(factor)
+            a_from_b = _between(self._factors[key], key[0]).fuse(a_from_b)
+        self.add_factor(Factor(*key, a_from_b))
 
     def has_arc(self, visit_a: int, visit_b: int) -> bool:
         """Return whether there is an arc between two visits."""

@@ -119,30 +119,42 @@ class Smoother:
         for index in kept:
             views[index] = transform_points(poses[index], seen[index].points.mean(axis=0)[None])
         tree = KDTree(views[kept])
+        times = np.array([keyframe.index for keyframe in keyframes])
         windows: dict[int, LocalMap] = {}
         ties = []
         for index in kept:
             sweep = self._sweep(seen[index], keyframes[index])
             near = kept[tree.query_ball_point(views[index], _NEAR_M)]
-            for other in self._other_times(index, near, views):
+            for other in self._other_times(index, near, views, times):
                 if other not in windows:
-                    windows[other] = self._window(other, seen, poses)
+                    windows[other] = self._window(other, seen, poses, times)
                 tie = self._tie(windows[other], sweep, inverse(poses[other]) @ poses[index])
                 if tie is not None:
                     ties.append(Factor(other, int(index), tie))
         return ties
 
-    def _other_times(self, index: int, near: npt.NDArray[np.intp], views: FloatArray) -> list[int]:
-        """Return the keyframe with the nearest view of each earlier time, the nearest first."""
-        earlier = np.sort(near[near < index - self._gap])
+    def _other_times(
+        self,
+        index: int,
+        near: npt.NDArray[np.intp],
+        views: FloatArray,
+        times: npt.NDArray[np.int64],
+    ) -> list[int]:
+        """Return the keyframe with the nearest view of each earlier time, the nearest first.
+
+        Where visits were forgotten, neighbours in the list are not neighbours in time.
+        """
+        earlier = np.sort(near[times[near] < times[index] - self._gap])
         if not len(earlier):
             return []
-        times = np.split(earlier, np.flatnonzero(np.diff(earlier) > self._gap) + 1)
         nearest = []
-        for time in times:
+        for time in np.split(earlier, np.flatnonzero(np.diff(times[earlier]) > self._gap) + 1):
             distances = np.linalg.norm(views[time] - views[index], axis=1)
             best = int(np.argmin(distances))
-            nearest.append((float(distances[best]), int(time[best]) // _STRIDE * _STRIDE))
+            middle = int(time[best]) // _STRIDE * _STRIDE
+            while times[time[best]] - times[middle] != time[best] - middle:
+                middle += 1
+            nearest.append((float(distances[best]), middle))
         return [other for _, other in sorted(nearest)[:_MOST_TIMES]]
 
     def _tie(self, window: LocalMap, sweep: Sweep, expected: Pose) -> GaussianPose | None:
@@ -170,8 +182,15 @@ class Smoother:
         odometry = self._config.odometry
         return sweep.thinned(odometry.voxel_size_m, odometry.max_points)
 
-    def _window(self, middle: int, seen: Sequence[SeenPoints], poses: FloatArray) -> LocalMap:
-        indices = range(max(0, middle - _WINDOW), min(len(poses), middle + _WINDOW + 1))
+    def _window(
+        self,
+        middle: int,
+        seen: Sequence[SeenPoints],
+        poses: FloatArray,
+        times: npt.NDArray[np.int64],
+    ) -> LocalMap:
+        around = range(max(0, middle - _WINDOW), min(len(poses), middle + _WINDOW + 1))
+        indices = [i for i in around if times[i] - times[middle] == i - middle]
         relative = [inverse(poses[middle]) @ poses[index] for index in indices]
         return LocalMap.of(
             SeenPoints.together(relative, [seen[index] for index in indices]),

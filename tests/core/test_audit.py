@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hmt_service.core.audit import Audit
+from hmt_service.core.audit import Audit, between
 from hmt_service.core.config import load_config
 from hmt_service.core.engine import Engine
 from hmt_service.core.odometry import Odometry
@@ -35,6 +35,17 @@ def test_what_is_older_than_many_is_dropped() -> None:
         audit.believe(belief(float(stamp_s), **{f"a{stamp_s}": 1.0}))
     assert [event.stamp_s for event in audit.events] == [2.0, 3.0, 4.0]
     assert [b.stamp_s for b in audit.beliefs] == [3.0, 4.0]
+
+
+def test_what_held_at_the_ends_of_an_interval_is_there() -> None:
+    beliefs = (belief(0.0, a0=1.0), belief(10.0, a0=0.5, a1=0.5), belief(20.0, a1=1.0))
+    cut = [(b.stamp_s, len(b.current_area)) for b in between(beliefs, 4.0, 15.0)]
+    assert cut == [(4.0, 1), (10.0, 2), (15.0, 2)]
+    assert [b.stamp_s for b in between(beliefs, 12.0, 18.0)] == [12.0, 18.0]
+    assert between(beliefs, 12.0, 18.0)[0].current_area == {0: 0.5, 1: 0.5}
+    assert between(beliefs, -np.inf, np.inf) == beliefs
+    assert between(beliefs, 30.0, 40.0) == ()
+    assert between((), 0.0, 1.0) == ()
 
 
 @pytest.fixture(scope="module")
