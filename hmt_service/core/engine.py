@@ -119,6 +119,17 @@ class Engine:
         doubts = self._plausibility.check(keyframe)
         return self._audited((*doubts, *self._map(keyframe, tracking.registration)))
 
+    def misses(self, tracking: Tracking) -> bool:
+        """Return whether a keyframe that a tracking is relative to never came.
+
+        Args:
+            tracking: What the odometry says of one scan.
+        """
+        known = self._open.last_keyframe + 1 if self._visits else 0
+        # Before the first keyframe scans are relative to none.
+        is_next = tracking.keyframe is not None or known == 0
+        return tracking.keyframe_index >= known + is_next
+
     def _map(self, keyframe: Keyframe, registration: Registration | None) -> tuple[Event, ...]:
         """Add a keyframe to every hypothesis."""
         if not self._visits:

@@ -91,8 +91,13 @@ class _Topology:
         self._busy_s = 0.0
 
     def map(self, tracked: Tracked) -> Mapped:
-        """Take one scan into the map."""
+        """Take one scan into the map, unless what it is relative to was thrown away before.
+
+        A daemon that has no time left discards what waits, and may still forward what comes after.
+        """
         assert tracked.tracking is not None, "the parent forwards scans only"
+        if self._engine.misses(tracked.tracking):
+            return Mapped(None, (), self._report())
         started = time.perf_counter()
         events = self._engine.process(tracked.tracking)
         self._busy_s += time.perf_counter() - started

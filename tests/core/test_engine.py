@@ -429,3 +429,17 @@ def test_nothing_is_there_before_the_first_keyframe() -> None:
     for ask in (lambda: engine.global_map(MapMethod.CONSISTENT), engine.compare):
         with pytest.raises(Unavailable, match="no keyframe"):
             ask()
+
+
+def test_a_scan_whose_keyframe_never_came_is_recognised() -> None:
+    odometry, engine = Odometry(load_config()), Engine(load_config())
+    path = ring_path(laps=0.2)
+    trackings = [t for r in drive(RING, path) if (t := odometry.process(r)) is not None]
+    keyframes = [index for index, t in enumerate(trackings) if t.keyframe is not None]
+    for tracking in trackings[: keyframes[2]]:
+        assert not engine.misses(tracking)
+        engine.process(tracking)
+    # The next keyframe is lost on the way: what is relative to it cannot be placed.
+    lost = keyframes[2]
+    assert not engine.misses(trackings[lost])
+    assert all(engine.misses(tracking) for tracking in trackings[lost + 1 :])
