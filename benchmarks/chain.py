@@ -155,7 +155,7 @@ def _map(readings: Iterable[Reading], result: Path, preset: Preset) -> None:
         )
         file.write(row().tobytes())
         file.seek(0)
-        rows = np.frombuffer(file.read()).reshape(-1, len(row()))
+        rows = np.frombuffer(file.read()).reshape(-1, 2 + len(clock.spent_s))
     trajectory, snapshot = engine.trajectory(), engine.snapshot()
     best = None if snapshot is None else snapshot.posterior.hypotheses[0]
     np.savez(

@@ -19,13 +19,6 @@ from hmt_service.core.geometry import GaussianPose, yaw_of
 from hmt_service.core.types import EventKind, MapMethod
 from hmt_service.service.keys import DEFAULT_ENDPOINT
 
-Run = Annotated[
-    Path | None,
-    typer.Argument(
-        metavar="[DIR]", help="What `hmt run` or a daemon has saved; a daemon if not given."
-    ),
-]
-
 if TYPE_CHECKING:
     from rich.table import Table
 
@@ -33,6 +26,12 @@ if TYPE_CHECKING:
     from hmt_service.service.client import HmtClient
     from hmt_service.service.reports import Status
 
+Run = Annotated[
+    Path | None,
+    typer.Argument(
+        metavar="[DIR]", help="What `hmt run` or a daemon has saved; a daemon if not given."
+    ),
+]
 Reference = Annotated[int | None, typer.Option(min=0, help="Area whose frame the map is in.")]
 Hypothesis = Annotated[
     int | None, typer.Option(min=0, help="Hypothesis; the most probable one if not given.")

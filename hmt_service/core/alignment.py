@@ -116,6 +116,14 @@ class Aligner:
         self._config = config.alignment
         self._covariance = config.covariance
         self._is_planar = config.sensor.is_planar
+        self._raster = Raster(
+            step_rad=self._config.angle_step_rad,
+            least=_FROM_ABOVE * self._config.min_overlap,
+            peak_share=_PEAK_SHARE,
+            separation_m=SEPARATION_M,
+            separation_rad=SEPARATION_RAD,
+            most=2 * self._config.max_modes,
+        )
         self._known: _Known | None = None
 
     def modes(self, visit: Visit, target: Visit, prior: GaussianPose) -> tuple[Mode, ...]:
@@ -212,7 +220,6 @@ class Aligner:
 
     def _correlate(self, visit: Visit, target: Visit, region: _Region) -> list[Pose]:
         """Return the best poses on a raster, seen from above; height and tilt are the region's."""
-        config = self._config
         yaw = yaw_of(region.mean)
         upright = planar_pose(0.0, 0.0, -yaw)[:3, :3] @ region.mean[:3, :3]
         peaks = target.view.best_peaks(
@@ -222,14 +229,7 @@ class Aligner:
             yaw=yaw,
             reach_m=region.reach_m,
             reach_rad=region.reach_rad,
-            raster=Raster(
-                step_rad=config.angle_step_rad,
-                least=_FROM_ABOVE * config.min_overlap,
-                peak_share=_PEAK_SHARE,
-                separation_m=SEPARATION_M,
-                separation_rad=SEPARATION_RAD,
-                most=2 * config.max_modes,
-            ),
+            raster=self._raster,
         )
         poses = []
         for peak in peaks:

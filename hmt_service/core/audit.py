@@ -7,7 +7,7 @@ References:
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -25,6 +25,7 @@ from hmt_service.core.types import (
 
 if TYPE_CHECKING:
     from hmt_service.core.hypotheses import Hypothesis, ParticleLayer
+    from hmt_service.core.transition import Successor
 
 # Beliefs that differ by no more than this are one that lasts.
 _EQUAL = 1e-6
@@ -70,25 +71,17 @@ def belief_of(posterior: Posterior) -> Belief:
     return Belief(posterior.stamp_s, posterior.current_area, posterior.effective_sample_size)
 
 
-def between(beliefs: Iterable[Belief], start_s: float, end_s: float) -> tuple[Belief, ...]:
+def between(beliefs: Sequence[Belief], start_s: float, end_s: float) -> tuple[Belief, ...]:
     """Return what was believed in an interval: what held at its ends is put there."""
-    chosen: list[Belief] = []
-    held: Belief | None = None
-    for belief in beliefs:
-        if belief.stamp_s > end_s:
-            break
-        if belief.stamp_s >= start_s:
-            if held is not None and not chosen and belief.stamp_s > start_s:
-                chosen.append(replace(held, stamp_s=start_s))
-            chosen.append(belief)
-        held = belief
-    else:
-        return tuple(chosen)
-    if held is not None:
-        if not chosen:
-            chosen.append(replace(held, stamp_s=start_s))
-        chosen.append(replace(held, stamp_s=end_s))
-    return tuple(chosen)
+    known = [belief for belief in beliefs if belief.stamp_s <= end_s]
+    before = [belief for belief in known if belief.stamp_s < start_s]
+    inside = known[len(before) :]
+    is_cut = len(known) < len(beliefs)
+    if before and (inside or is_cut) and (not inside or inside[0].stamp_s > start_s):
+        inside.insert(0, replace(before[-1], stamp_s=start_s))
+    if inside and is_cut:
+        inside.append(replace(inside[-1], stamp_s=end_s))
+    return tuple(inside)
 
 
 def _is_same(first: Belief, second: Belief) -> bool:
@@ -117,19 +110,17 @@ def entered(particles: ParticleLayer, stamp_s: float) -> Event:
     )
 
 
-def branched(
-    parent: Hypothesis, child: Hypothesis, *, overlap: float, log_factor: float, stamp_s: float
-) -> Event:
+def branched(parent: Hypothesis, child: Hypothesis, successor: Successor, stamp_s: float) -> Event:
     """Return that one hypothesis has become another: where it says that the robot is, and why.
 
     Args:
         parent: What was believed before.
         child: What may be believed since.
-        overlap: Share of what was seen that the area explains.
-        log_factor: Log of the probability of being there times that of what was seen.
+        successor: The place that makes the difference.
         stamp_s: Sensor time.
     """
     current = child.current
+    overlap, log_factor = successor.overlap, successor.log_factor
     place = "a new area" if current.area_from_visit is None else f"area {current.area} again"
     if current.area_from_visit is None and overlap > 0.0:
         place = "a new area that sees a known one"

@@ -177,15 +177,11 @@ class View:
 
 def _sides_of(directions: FloatArray) -> list[npt.NDArray[np.bool_]]:
     """Return for each side which directions belong to it, each of shape (N,)."""
-    is_flat = _is_flat(directions)
+    is_flat = np.hypot(directions[:, 0], directions[:, 1]) < _FLAT
     yaws = np.arctan2(directions[:, 1], directions[:, 0])
     gaps = yaws - 2.0 * np.pi / _SIDES * np.arange(_SIDES)[:, None]
     is_near = np.abs(np.arctan2(np.sin(gaps), np.cos(gaps))) <= _SIDE_RAD
     return [*(is_near & ~is_flat), is_flat]
-
-
-def _is_flat(directions: FloatArray) -> npt.NDArray[np.bool_]:
-    return np.asarray(np.hypot(directions[:, 0], directions[:, 1]) < _FLAT)
 
 
 @njit(cache=True)

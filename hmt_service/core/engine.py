@@ -43,7 +43,6 @@ from hmt_service.core.types import (
     NO_POINTS,
     ArcResidual,
     AreaDifference,
-    Belief,
     Comparison,
     Event,
     GlobalMap,
@@ -263,7 +262,7 @@ class Engine:
                     log_weight=hypothesis.log_weight + match.log_factor,
                 )
                 recognising.append(child)
-                branched.append(_branched(hypothesis, child, match, stamp_s))
+                branched.append(audit.branched(hypothesis, child, match, stamp_s))
         if not recognising:
             return ()
         pruned = self._particles.replace([*known, *recognising])
@@ -287,7 +286,7 @@ class Engine:
                 )
                 expanded.append(child)
                 if is_branch:
-                    branched.append(_branched(hypothesis, child, successor, stamp_s))
+                    branched.append(audit.branched(hypothesis, child, successor, stamp_s))
         return expanded, branched
 
     def _weigh(self, keyframe: Keyframe) -> tuple[Event, ...]:
@@ -347,15 +346,13 @@ class Engine:
         self._next_hypothesis += 1
         return self._next_hypothesis - 1
 
-    # ------------------------------------------------------------------ what readers may ask
-
     def _audited(self, events: tuple[Event, ...]) -> tuple[Event, ...]:
         """Keep what was decided, and what is believed since."""
-        particles = self._particles
-        stamp_s, ess = self._open.keyframes[-1].stamp_s, particles.effective_sample_size
         self._audit.note(events)
-        self._audit.believe(Belief(stamp_s, particles.current_area(), ess))
+        self._audit.believe(self._particles.belief(self._open.keyframes[-1].stamp_s))
         return events
+
+    # ------------------------------------------------------------------ what readers may ask
 
     @property
     def audit(self) -> Audit:
@@ -382,15 +379,15 @@ class Engine:
         if not self._visits:
             return None
         best, visit = self._particles.best, self._open
-        summaries = self._particles.summaries()
+        belief = self._particles.belief(visit.keyframes[-1].stamp_s)
         visit_from_keyframe = visit.visit_from_keyframe[-1]
         return Snapshot(
             posterior=Posterior(
-                stamp_s=visit.keyframes[-1].stamp_s,
+                stamp_s=belief.stamp_s,
                 revision=self._revision,
-                hypotheses=summaries,
-                current_area=self._particles.current_area(),
-                effective_sample_size=self._particles.effective_sample_size,
+                hypotheses=self._particles.summaries(),
+                current_area=belief.current_area,
+                effective_sample_size=belief.effective_sample_size,
             ),
             keyframe_index=visit.last_keyframe,
             area_from_keyframe=best.area_from_visit(visit.visit) @ visit_from_keyframe,
@@ -569,16 +566,6 @@ def _said_of(tracking: Tracking) -> list[str]:
         said += ["degenerate"] if len(registration.degenerate) else []
         said += ["contradicted"] if registration.prior_weight < 1.0 else []
     return said
-
-
-def _branched(parent: Hypothesis, child: Hypothesis, successor: Successor, stamp_s: float) -> Event:
-    return audit.branched(
-        parent,
-        child,
-        overlap=successor.overlap,
-        log_factor=successor.log_factor,
-        stamp_s=stamp_s,
-    )
 
 
 def _assignment(visit: int, successor: Successor) -> Assignment:

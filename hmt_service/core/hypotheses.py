@@ -30,7 +30,7 @@ from hmt_service.core.geometry import (
 )
 from hmt_service.core.graph import Factor, PoseGraph
 from hmt_service.core.submap import Visit
-from hmt_service.core.types import HypothesisSummary
+from hmt_service.core.types import Belief, HypothesisSummary
 
 # Maps that differ by no more than this anywhere are the same.
 _EQUAL_M, _EQUAL_RAD = 0.1, 0.03
@@ -237,6 +237,14 @@ class ParticleLayer:
             area = hypothesis.current.area
             marginal[area] = marginal.get(area, 0.0) + float(probability)
         return marginal
+
+    def belief(self, stamp_s: float) -> Belief:
+        """Return what is believed of where the robot is.
+
+        Args:
+            stamp_s: Sensor time of the last observation.
+        """
+        return Belief(stamp_s, self.current_area(), self.effective_sample_size)
 
     def replace(self, hypotheses: Sequence[Hypothesis]) -> tuple[Hypothesis, ...]:
         """Take a new set, normalise it, drop what is negligible and resample down to the budget.

@@ -37,7 +37,7 @@ from hmt_service.core.types import (
     Tracking,
     TrackingFailure,
 )
-from hmt_service.core.wheels import WheelCalibration
+from hmt_service.core.wheels import WheelCalibration, sigmas_of
 from hmt_service.errors import InvalidInput
 
 # Of a heading that may be anything, and of a position that nothing but speed bounds.
@@ -174,13 +174,13 @@ class Odometry:
             # Scans that came without odometry have been tracked through part of it already.
             motion = inverse(self._motion_since_odometry) @ measured
             xi = log(measured)
-            turned, travelled = float(np.linalg.norm(xi[:3])), float(np.linalg.norm(xi[3:]))
-            sigma_rad = (
-                noise.sigma_floor_rad
-                + noise.sigma_rotation_share * turned
-                + noise.sigma_rotation_rad_per_m * travelled
+            sigma_rad, sigma_m = sigmas_of(
+                noise,
+                float(np.linalg.norm(xi[:3])),
+                float(np.linalg.norm(xi[3:])),
+                floor_rad=noise.sigma_floor_rad,
+                floor_m=noise.sigma_floor_m,
             )
-            sigma_m = noise.sigma_floor_m + noise.sigma_translation_share * travelled
         elif self._last_elapsed_s > 0.0:
             motion = exp(elapsed_s / self._last_elapsed_s * log(self._last_motion))
             # Speed has changed since the interval before, for as long as this one takes.

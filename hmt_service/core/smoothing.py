@@ -78,15 +78,14 @@ class Smoother:
             visits: All visits.
         """
         poses = hypothesis.keyframe_poses(visits)
-        kept = [visit for number, visit in visits.items() if not visits.is_forgotten(number)]
+        kept = [visits[visit] for visit in visits if not visits.is_forgotten(visit)]
         smoothed = self._smoothed(hypothesis, kept, poses)
-        first_of = {visit.visit: visit.first_keyframe for visit in kept}
-        for visit in visits.values():
-            if visit.visit not in first_of:
-                founder = first_of[hypothesis.topology.assignments[visit.visit].area]
-                moved = smoothed[founder] @ inverse(poses[founder])
-                own = slice(visit.first_keyframe, visit.last_keyframe + 1)
-                smoothed[own] = moved @ poses[own]
+        first_of = np.cumsum([0, *map(visits.keyframes, visits)])
+        for visit in filter(visits.is_forgotten, visits):
+            founder = first_of[hypothesis.topology.assignments[visit].area]
+            moved = smoothed[founder] @ inverse(poses[founder])
+            own = slice(first_of[visit], first_of[visit + 1])
+            smoothed[own] = moved @ poses[own]
         return smoothed
 
     def _smoothed(
@@ -152,7 +151,7 @@ class Smoother:
             distances = np.linalg.norm(views[time] - views[index], axis=1)
             best = int(np.argmin(distances))
             middle = int(time[best]) // _STRIDE * _STRIDE
-            while times[time[best]] - times[middle] != time[best] - middle:
+            while not _is_unbroken(times, middle, int(time[best])):
                 middle += 1
             nearest.append((float(distances[best]), middle))
         return [other for _, other in sorted(nearest)[:_MOST_TIMES]]
@@ -190,13 +189,18 @@ class Smoother:
         times: npt.NDArray[np.int64],
     ) -> LocalMap:
         around = range(max(0, middle - _WINDOW), min(len(poses), middle + _WINDOW + 1))
-        indices = [i for i in around if times[i] - times[middle] == i - middle]
+        indices = [i for i in around if _is_unbroken(times, i, middle)]
         relative = [inverse(poses[middle]) @ poses[index] for index in indices]
         return LocalMap.of(
             SeenPoints.together(relative, [seen[index] for index in indices]),
             self._config,
             sigma_m=self._config.covariance.sigma_m,
         )
+
+
+def _is_unbroken(times: npt.NDArray[np.int64], first: int, second: int) -> bool:
+    """Return whether no keyframe between two of a list was left out of it."""
+    return bool(times[second] - times[first] == second - first)
 
 
 def _motions(keyframes: Sequence[Keyframe]) -> list[Factor]:

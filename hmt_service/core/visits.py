@@ -47,29 +47,27 @@ class _Path:
 
     @classmethod
     def of(cls, visit: Visit) -> _Path:
-        keyframes = visit.keyframes
+        keyframes, upper = visit.keyframes, _upper(visit.config)
         return cls(
             visit.visit,
             visit.first_keyframe,
             np.array([k.stamp_s for k in keyframes]),
             np.array([k.sensor_in_body for k in keyframes], dtype=np.float32),
             np.array([k.previous_from_body.mean[:3] for k in keyframes], dtype=np.float32),
-            np.array(
-                [k.previous_from_body.covariance[_upper(visit.config)] for k in keyframes],
-                dtype=np.float32,
-            ),
+            np.array([k.previous_from_body.covariance[upper] for k in keyframes], dtype=np.float32),
             tuple(k.failure for k in keyframes),
             visit.config,
         )
 
     def as_visit(self) -> Visit:
         """Return the visit, as one that saw nothing."""
-        keyframes = [self._keyframe(position) for position in range(len(self.stamps_s))]
+        upper = _upper(self.config)
+        keyframes = [self._keyframe(position, upper) for position in range(len(self.stamps_s))]
         return visit_of(self.visit, keyframes, self.config)
 
-    def _keyframe(self, position: int) -> Keyframe:
+    def _keyframe(self, position: int, upper: tuple[np.ndarray, np.ndarray]) -> Keyframe:
         covariance = np.zeros((6, 6))
-        covariance[_upper(self.config)] = self.covariances[position]
+        covariance[upper] = self.covariances[position]
         covariance = confined(
             covariance + np.triu(covariance, 1).T, is_planar=self.config.sensor.is_planar
         )

@@ -23,6 +23,31 @@ _GATE = 16.3
 _LEAST_M, _LEAST_RAD = 0.05, 0.05
 
 
+def sigmas_of(
+    noise: MotionConfig,
+    turned_rad: float,
+    travelled_m: float,
+    *,
+    floor_rad: float = 0.0,
+    floor_m: float = 0.0,
+) -> tuple[float, float]:
+    """Return the standard deviations of a step that wheels tell, rad and m.
+
+    Args:
+        noise: What is known of the wheels.
+        turned_rad: By how much the robot turned, not negative.
+        travelled_m: How far it went.
+        floor_rad: What is wrong with every step.
+        floor_m: The same of its length.
+    """
+    sigma_rad = (
+        floor_rad
+        + noise.sigma_rotation_share * turned_rad
+        + noise.sigma_rotation_rad_per_m * travelled_m
+    )
+    return sigma_rad, floor_m + noise.sigma_translation_share * travelled_m
+
+
 class WheelCalibration:
     """Estimates scale, turn scale and drift of wheel odometry from registered steps."""
 
@@ -71,11 +96,8 @@ class WheelCalibration:
         jacobian = np.zeros((3, 3))
         jacobian[0] = [0.0, turned, length]
         jacobian[1:, 0] = xi[3:5]
-        noise, white = self._noise, np.zeros(3)
-        white[0] = (
-            noise.sigma_rotation_share * abs(turned) + noise.sigma_rotation_rad_per_m * length
-        )
-        white[1:] = noise.sigma_translation_share * length
+        sigma_rad, sigma_m = sigmas_of(self._noise, abs(turned), length)
+        white = np.array([sigma_rad, sigma_m, sigma_m])
         seen = covariance[np.ix_(PLANAR_AXES, PLANAR_AXES)] + np.diag((_WHITE * white) ** 2)
         innovation = jacobian @ self._covariance @ jacobian.T + seen
         if gap @ np.linalg.solve(innovation, gap) > _GATE:

@@ -103,8 +103,10 @@ def test_branch_and_bound_finds_what_an_exhaustive_search_finds(least: float) ->
 def test_a_wall_seen_from_its_other_side_is_another_one() -> None:
     points, directions = HERE
     view = View.of(points, -directions, cell_m=CELL_M)
-    near = {"middle": np.zeros(2), "yaw": 0.0, "reach_m": 0.3, "reach_rad": 0.1}
-    assert view.best_peaks(*HERE, **near, raster=RASTER) == []  # type: ignore[arg-type]
+    peaks = view.best_peaks(
+        *HERE, middle=np.zeros(2), yaw=0.0, reach_m=0.3, reach_rad=0.1, raster=RASTER
+    )
+    assert peaks == []
 
 
 def test_who_asks_for_a_wider_region_finds_the_same_places() -> None:
