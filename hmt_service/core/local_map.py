@@ -54,7 +54,8 @@ _SEARCH_RAD = np.linspace(-0.6, 0.6, 13)
 _FOUND_SHARE, _CONTRADICTED, _BETTER = 0.5, 0.9, 1.5
 # Normals are good to so many rad: a direction that is opposed by less than the square of it, as a
 # share of what opposes the best-known one, may be opposed by nothing else.
-_TILT = 0.1
+# Those of lines are fitted to fewer points than those of planes.
+_TILT = {3: 0.1, 6: 0.05}
 # Standard deviation of a direction that a scan says nothing about, m and rad.
 _UNSEEN = 10.0
 # Largest squared distance of a prior that is believed: 95 % of all that are honest are nearer.
@@ -347,7 +348,7 @@ def _known_directions(
     lever_m = np.sqrt(max(diagonal[is_turn].mean() / diagonal[~is_turn].mean(), 1e-6))
     scale = np.where(is_turn, 1.0 / lever_m, 1.0)
     values, vectors = np.linalg.eigh(symmetric(information[block] * np.outer(scale, scale)))
-    is_known = values >= max(least, _TILT**2 * values[-1])
+    is_known = values >= max(least, _TILT[len(axes)] ** 2 * values[-1])
     kept = (vectors[:, is_known] * values[is_known]) @ vectors[:, is_known].T
     result[block] = symmetric(kept / np.outer(scale, scale))
     degenerate = np.zeros((int(np.sum(~is_known)), 6))

@@ -278,16 +278,13 @@ class Odometry:
     def _error_of(self, sweep: Sweep, motion: FloatArray, predicted: FloatArray) -> FloatArray:
         """Return the covariance of a pose because the motion during its sweep was not uniform.
 
-        Turns begin and end within one sweep; speed changes from sweep to sweep. Where the turn is
-        not the one that was predicted, it may have happened at any time of the sweep.
+        Turns begin and end within one sweep; speed changes from sweep to sweep. Where the motion is
+        not the one that was predicted, it may have changed at any time of the sweep.
         """
         if sweep.is_instant or self._last_sweep_motion is None:
             return np.zeros((6, 6))
-        share, before = self._covariance.uneven_motion_share, self._last_sweep_motion
-        sigma = share * np.abs(motion - before)
-        turn = np.maximum(np.abs(motion), np.abs(before))[:3]
-        sigma[:3] = np.maximum(share * turn, 0.5 * np.abs(motion - predicted)[:3])
-        return np.diag(sigma**2)
+        change = np.maximum(np.abs(motion - self._last_sweep_motion), np.abs(motion - predicted))
+        return np.diag((self._covariance.uneven_motion_share * change) ** 2)
 
     def _confined(self, pose: GaussianPose) -> GaussianPose:
         """Return the pose as uncertain as the robot can be: in the plane if it is planar."""
