@@ -54,7 +54,10 @@ class Mode:
     """One way to lay a visit's submap over another."""
 
     target_from_visit: GaussianPose
-    """Relative pose by registration, with the covariance of the registration."""
+    """Relative pose of the frames, with the covariance of the registration and of how far both
+    submaps are bent."""
+    width: FloatArray
+    """Covariance of the registration alone, shape (6, 6): width of the peak of the likelihood."""
     overlap: float
     """Share of the visit's points that the target explains there, in [0, 1]."""
 
@@ -165,17 +168,15 @@ class Aligner:
         if not fit.is_converged or fit.inlier_share < min_overlap:
             return None
         moved = adjoint(inverse(fit.pose))
-        covariance = (
-            fit.own_covariance
-            + visit.bend
-            + moved @ target.bend @ moved.T
-            + isotropic_covariance(
-                sigma_rad=self._covariance.floor_submap_rad,
-                sigma_m=self._covariance.floor_submap_m,
-            )
+        width = fit.own_covariance + isotropic_covariance(
+            sigma_rad=self._covariance.floor_submap_rad, sigma_m=self._covariance.floor_submap_m
         )
-        confined_covariance = confined(covariance, is_planar=self._is_planar)
-        return Mode(GaussianPose(fit.pose, confined_covariance), fit.inlier_share)
+        covariance = width + visit.bend + moved @ target.bend @ moved.T
+        return Mode(
+            GaussianPose(fit.pose, confined(covariance, is_planar=self._is_planar)),
+            confined(width, is_planar=self._is_planar),
+            fit.inlier_share,
+        )
 
     def _refined(self, visit: Visit, target: Visit, guess: Pose) -> Mode | None:
         """Return what `refine` does, for a guess that few points speak for, and only once."""

@@ -305,7 +305,8 @@ class Engine:
             return 0.0
         area_from_visit = inverse(hypothesis.graph.pose(area)) @ hypothesis.graph.pose(visit.visit)
         pose = area_from_visit @ visit.visit_from_keyframe[-1].mean
-        log_ratio = self._observation.log_ratio(keyframe, self._visits[area].points, pose)
+        known = self._visits[area].known_from(pose[:3, 3])
+        log_ratio = self._observation.log_ratio(keyframe, known, pose)
         return visit.novelty[-1] * log_ratio
 
     def _unweigh(self, keyframes: Sequence[Keyframe]) -> None:

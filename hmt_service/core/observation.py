@@ -11,9 +11,12 @@ import numpy as np
 
 from hmt_service.core.config import ObservationConfig, SensorConfig
 from hmt_service.core.geometry import FloatArray, Pose, inverse, transform_points
+from hmt_service.core.local_map import SeenPoints
 from hmt_service.core.types import Keyframe
 
 _BIN_M = 0.25
+# If this share of the beams is into known space, they say as much as all would.
+_COVERED = 0.5
 
 
 class BackgroundDensity:
@@ -59,29 +62,34 @@ class ObservationModel:
         """Let the background density see one keyframe."""
         self.background.learn(_ranges(keyframe.points_in_body - keyframe.sensor_in_body))
 
-    def log_ratio(self, keyframe: Keyframe, submap: FloatArray, submap_from_body: Pose) -> float:
+    def log_ratio(self, keyframe: Keyframe, submap: SeenPoints, submap_from_body: Pose) -> float:
         """Return log p(z | x, submap) - log p0(z) of one keyframe, tempered for correlated beams.
 
-        Beams into space that the submap does not know count zero: there, both follow p0.
+        Beams into space that the submap does not know say nothing: there, both follow p0. The
+        others say what all would, if they are many: how much of a place was seen through a door is
+        no difference between two rooms.
 
         Args:
             keyframe: The observation.
-            submap: Points of the submap, shape (N, 3), m.
+            submap: What is known to be there.
             submap_from_body: Pose of the keyframe in the submap's frame.
         """
         rays = keyframe.points_in_body - keyframe.sensor_in_body
         if not len(rays):
             return 0.0
         ranges = _ranges(rays)
-        predicted = transform_points(inverse(submap_from_body), submap) - keyframe.sensor_in_body
-        expected = self._expectations(predicted, rays)
+        predicted = transform_points(inverse(submap_from_body), submap.points)
+        predicted -= keyframe.sensor_in_body
+        directions = submap.directions @ submap_from_body[:3, :3]
+        expected = self._expectations(predicted, directions, rays)
         is_known = np.isfinite(expected[1])
         if not np.any(is_known):
             return 0.0
         density = self._hit_density(ranges[is_known], expected[:, is_known])
         hit = self._config.hit_weight
         ratio = np.log(hit * density / self.background.density(ranges[is_known]) + (1.0 - hit))
-        return float(ratio.sum() * min(1.0, self._config.independent_beams / len(rays)))
+        covered = min(1.0, float(np.mean(is_known)) / _COVERED)
+        return float(ratio.mean() * covered * min(len(rays), self._config.independent_beams))
 
     def _hit_density(self, ranges: FloatArray, expected: FloatArray) -> FloatArray:
         """Return the density of each range, shape (N,), 1/m: the mean over its expectations."""
@@ -91,14 +99,22 @@ class ObservationModel:
         densities = np.exp(-0.5 * residual**2) / (np.sqrt(2.0 * np.pi) * sigma)
         return np.asarray((densities * is_there).sum(axis=0) / is_there.sum(axis=0))
 
-    def _expectations(self, predicted: FloatArray, rays: FloatArray) -> FloatArray:
+    def _expectations(
+        self, predicted: FloatArray, directions: FloatArray, rays: FloatArray
+    ) -> FloatArray:
         """Return three expected ranges per beam, shape (3, N), inf where the submap has nothing.
 
         They are those of the beam's own cell (the second) and of its two neighbours: on a wall seen
         at a grazing angle one cell spans metres of range, and any of them may be the one to come.
+        Where the first surface is one whose other side was seen, nobody knows how thick it is.
         """
+        cells, ranges = self._cells(predicted), _ranges(predicted)
         grid = np.full(self._rows * self._columns, np.inf)
-        np.minimum.at(grid, self._cells(predicted), _ranges(predicted))
+        np.minimum.at(grid, cells, ranges)
+        is_behind = np.einsum("ni,ni->n", directions, predicted) > 0.0
+        behind = np.full(len(grid), np.inf)
+        np.minimum.at(behind, cells[is_behind], ranges[is_behind])
+        grid[behind <= grid] = np.inf
         row, column = np.divmod(self._cells(rays), self._columns)
         return np.stack(
             [grid[row * self._columns + (column + step) % self._columns] for step in (-1, 0, 1)]

@@ -141,7 +141,7 @@ class Odometry:
         if is_keyframe and fit is not None and failure is None:
             self._learn(posed.mean, fit.own_covariance + 2.0 * error)
         if is_keyframe:
-            if failure is not None and not self._has_new_odometry:
+            if failure is not None and not self._is_bridged:
                 told = self._lost(told.mean, scan.stamp_s - self._registered_s)
             return self._add_keyframe(
                 scan, sweep.at_end(sweep_motion), told, error, registration, failure
@@ -164,6 +164,11 @@ class Odometry:
     def _has_new_odometry(self) -> bool:
         """Whether odometry has come since the scan before."""
         return self._odometry is not self._odometry_at_scan
+
+    @property
+    def _is_bridged(self) -> bool:
+        """Whether odometry leads from the scan before to this one."""
+        return self._odometry_at_scan is not None and self._has_new_odometry
 
     def _predict(self, elapsed_s: float) -> GaussianPose:
         """Return the motion since the last scan: by the wheels, or as it was before."""
@@ -225,8 +230,7 @@ class Odometry:
     ) -> tuple[GaussianPose, Fit | None, TrackingFailure | None]:
         """Return the pose in the last keyframe after the scan has been seen, and how it fits."""
         config = self._config.odometry
-        is_bridged = self._odometry_at_scan is not None and self._has_new_odometry
-        if elapsed_s > config.max_gap_s and not is_bridged:
+        if elapsed_s > config.max_gap_s and not self._is_bridged:
             return predicted, None, TrackingFailure.GAP_IN_TIME
         if self._map is None or len(sweep.points) < config.min_points:
             return predicted, None, TrackingFailure.TOO_FEW_POINTS

@@ -16,6 +16,7 @@ from functools import cached_property, lru_cache
 from itertools import pairwise
 
 import numpy as np
+import numpy.typing as npt
 
 from hmt_service.core.area_abstraction import Cells, cells_of
 from hmt_service.core.config import Config
@@ -78,9 +79,14 @@ class Visit:
         """
         return self.seen.points
 
-    @cached_property
+    @property
     def seen(self) -> SeenPoints:
         """The submap, with the side that each point was seen from."""
+        return self._submap[0]
+
+    @cached_property
+    def _submap(self) -> tuple[SeenPoints, npt.NDArray[np.int32]]:
+        """The submap, and the position of the keyframe that saw each point."""
         cell_m, is_planar = self.config.odometry.voxel_size_m, self.config.sensor.is_planar
         poses = [pose.mean for pose in self.visit_from_keyframe]
         clouds = without_transients(self.keyframes, poses, self.config)
@@ -93,8 +99,9 @@ class Visit:
             for cloud, sensor in zip(clouds, sensors, strict=True)
         ]
         whole = SeenPoints.together([identity()] * len(seen), seen)
+        seen_by = np.repeat(np.arange(len(seen), dtype=np.int32), [len(s.points) for s in seen])
         kept = thin(whole.points, _SUBMAP_CELLS * cell_m)
-        return SeenPoints(whole.points[kept], whole.directions[kept])
+        return SeenPoints(whole.points[kept], whole.directions[kept]), seen_by[kept]
 
     @cached_property
     def sweep(self) -> Sweep:
@@ -119,6 +126,29 @@ class Visit:
     def points_in(self, frame_from_visit: Pose) -> FloatArray:
         """Return the submap in another frame, shape (N, 3), m."""
         return transform_points(frame_from_visit, self.points)
+
+    def known_from(self, position: FloatArray) -> SeenPoints:
+        """Return what of the submap is known from a place as well as a range is expected.
+
+        Long visits are bent: what was seen early and late in one does not fit together everywhere.
+
+        Args:
+            position: The place in the visit's frame, shape (3,), m.
+        """
+        max_sigma_m = self.config.observation.hit_sigma_m
+        positions, sigmas_m = self._positions
+        nearest = np.argmin(np.linalg.norm(positions - position, axis=1))
+        is_known = np.abs(sigmas_m**2 - sigmas_m[nearest] ** 2) <= max_sigma_m**2
+        if np.all(is_known):
+            return self.seen
+        kept = is_known[self._submap[1]]
+        return SeenPoints(self.points[kept], self.seen.directions[kept])
+
+    @cached_property
+    def _positions(self) -> tuple[FloatArray, FloatArray]:
+        """Positions of the keyframes, shape (K, 3), and their standard deviations, (K,), m."""
+        poses = self.visit_from_keyframe
+        return np.array([p.mean[:3, 3] for p in poses]), np.array([p.sigma_m for p in poses])
 
     @property
     def local_map(self) -> LocalMap:

@@ -158,7 +158,11 @@ class Transition:
     ) -> list[_Candidate]:
         """Return the areas whose extent the prior reaches, the nearest first."""
         most, graph = self._config.max_candidates, hypothesis.graph
-        areas = np.array([a for a in hypothesis.topology.areas if a != hypothesis.current.area])
+        # The visit before ended where its own content does. An older area may go on beyond that,
+        # and who does not know how he went may not have left at all.
+        is_known = is_certain(known_from_visit, self._refinement)
+        left = known if is_known and hypothesis.current.area == known else None
+        areas = np.array([area for area in hypothesis.topology.areas if area != left])
         if not len(areas):
             return []
         extents = visits.extents(visit.visit)[areas]
@@ -200,23 +204,27 @@ class Transition:
         # The peak of prior times likelihood; along a corridor only the prior says where that is.
         peak = prior.fuse(mode.target_from_visit).mean
         log_ratio = sum(
-            novelty * self._observation.log_ratio(keyframe, target.points, peak @ pose.mean)
+            novelty
+            * self._observation.log_ratio(
+                keyframe, target.known_from((peak @ pose.mean)[:3, 3]), peak @ pose.mean
+            )
             for keyframe, pose, novelty in zip(
                 visit.keyframes, visit.visit_from_keyframe, visit.novelty, strict=True
             )
         )
-        return log_ratio + self._log_prior(prior, mode.target_from_visit)
+        return log_ratio + self._log_prior(prior, mode)
 
-    def _log_prior(self, prior: GaussianPose, pose: GaussianPose) -> float:
+    def _log_prior(self, prior: GaussianPose, mode: Mode) -> float:
         """Return log of N(x*; prior) times the volume of the mode.
 
-        With a likelihood peak of shape N(x; x*, S), the integral over the prior N(x; m, P) is
-        sqrt(|S| / |P + S|) exp(-1/2 (x* - m)' (P + S)^-1 (x* - m)) times its height.
+        With a likelihood peak of shape N(x; x*, S), where x* is itself known with covariance B
+        because submaps are bent, the integral over the prior N(x; m, P) is
+        sqrt(|S| / |P + B + S|) exp(-1/2 (x* - m)' (P + B + S)^-1 (x* - m)) times its height.
         """
-        block = np.ix_(self._axes, self._axes)
+        block, pose = np.ix_(self._axes, self._axes), mode.target_from_visit
         together: FloatArray = prior.covariance[block] + pose.covariance[block]
         gap = log(inverse(prior.mean) @ pose.mean)[self._axes]
-        _, log_volume = np.linalg.slogdet(pose.covariance[block])
+        _, log_volume = np.linalg.slogdet(mode.width[block])
         _, log_prior_volume = np.linalg.slogdet(together)
         return float(
             0.5 * (log_volume - log_prior_volume) - 0.5 * gap @ np.linalg.solve(together, gap)

@@ -12,19 +12,31 @@ from hypothesis import strategies as st
 from hmt_service.core.config import Preset, load_config
 from hmt_service.core.geometry import (
     FloatArray,
+    Pose,
     identity,
     inverse,
     planar_pose,
     transform_points,
 )
+from hmt_service.core.local_map import SeenPoints
 from hmt_service.core.observation import BackgroundDensity, ObservationModel
 from hmt_service.core.types import Keyframe
 from tests.core.factories import ROOM, SQUARE, cloud_of, keyframes_along, visit_along
 
 CONFIG = load_config()
+
+
+def seen(points: FloatArray, pose: Pose) -> SeenPoints:
+    """Return points as a sensor at a pose sees them."""
+    directions = pose[:3, 3] - points
+    lengths = np.linalg.norm(directions, axis=1, keepdims=True)
+    return SeenPoints(points, directions / np.maximum(lengths, 1e-9))
+
+
 TRUTH = planar_pose(0.5, -0.4, 0.4)
-SUBMAP = cloud_of(ROOM, spacing_m=0.03)
+SUBMAP = seen(cloud_of(ROOM, spacing_m=0.03), TRUTH)
 (KEYFRAME,) = keyframes_along(ROOM, [TRUTH])
+ANGLES = np.linspace(-np.pi, np.pi, 720, endpoint=False) + 0.004
 
 
 def model_of(*learned: Keyframe) -> ObservationModel:
@@ -69,13 +81,13 @@ def test_ratio_of_a_perfect_match_has_the_closed_form() -> None:
     sigma, hit = CONFIG.observation.hit_sigma_m, CONFIG.observation.hit_weight
     per_beam = np.log(hit / (np.sqrt(2.0 * np.pi) * sigma) * 40.0 + 1.0 - hit)
     beams = CONFIG.observation.independent_beams
-    assert model_of().log_ratio(keyframe, circle, identity()) == pytest.approx(
+    assert model_of().log_ratio(keyframe, seen(circle, identity()), identity()) == pytest.approx(
         per_beam * beams, rel=1e-4
     )
     # A circle that is larger by two standard deviations.
     larger = circle * (1.0 + 2.0 * sigma / 2.0)
     off = np.log(hit * np.exp(-2.0) / (np.sqrt(2.0 * np.pi) * sigma) * 40.0 + 1.0 - hit)
-    assert model_of().log_ratio(keyframe, larger, identity()) == pytest.approx(
+    assert model_of().log_ratio(keyframe, seen(larger, identity()), identity()) == pytest.approx(
         off * beams, rel=1e-4
     )
 
@@ -90,23 +102,48 @@ def test_true_pose_is_likelier_than_the_background_and_than_any_wrong_one() -> N
 
 def test_unknown_space_says_nothing() -> None:
     model = model_of(KEYFRAME)
-    assert model.log_ratio(KEYFRAME, np.zeros((0, 3)), TRUTH) == 0.0
+    assert model.log_ratio(KEYFRAME, seen(np.zeros((0, 3)), TRUTH), TRUTH) == 0.0
     empty = replace(KEYFRAME, points_in_body=np.zeros((0, 3), dtype=np.float32))
     assert model.log_ratio(empty, SUBMAP, TRUTH) == 0.0
 
 
-def test_beams_into_unknown_space_do_not_change_the_sum() -> None:
-    # Half of the walls known: exactly the beams of that half count, each as it did before.
+def test_half_of_the_beams_say_as_much_as_all() -> None:
+    # How much of a place was seen through a door is no difference between two places.
     keyframe = replace(
         KEYFRAME,
         points_in_body=np.array([[2.0, 0.0, 0.0], [-3.0, 0.0, 0.0]], dtype=np.float32),
     )
-    wall = np.array([[2.0, y, 0.0] for y in np.linspace(-0.2, 0.2, 41)])
+    front = [[2.0, y, 0.0] for y in np.linspace(-0.2, 0.2, 41)]
+    back = [[-3.0, y, 0.0] for y in np.linspace(-0.2, 0.2, 41)]
     model = model_of()
-    alone = replace(keyframe, points_in_body=keyframe.points_in_body[:1])
-    both = model.log_ratio(keyframe, wall, identity())
-    assert both == pytest.approx(model.log_ratio(alone, wall, identity()))
-    assert both > 1.0
+    one, both = (
+        model.log_ratio(keyframe, seen(np.array(walls), identity()), identity())
+        for walls in (front, front + back)
+    )
+    assert one == pytest.approx(both)
+    assert one > 1.0
+
+
+def test_few_beams_into_known_space_say_little() -> None:
+    points = 2.0 * np.stack([np.cos(ANGLES), np.sin(ANGLES), np.zeros(len(ANGLES))], axis=1)
+    keyframe = replace(KEYFRAME, points_in_body=points.astype(np.float32))
+    model, arc = model_of(), seen(points, identity())
+    whole = model.log_ratio(keyframe, arc, identity())
+    for share, counted in ((0.5, 1.0), (0.25, 0.5), (0.1, 0.2)):
+        part = SeenPoints(*(a[: int(share * len(points))] for a in (arc.points, arc.directions)))
+        ratio = model.log_ratio(keyframe, part, identity())
+        assert ratio == pytest.approx(counted * whole, rel=0.03)
+
+
+def test_the_other_side_of_a_wall_says_nothing() -> None:
+    # Seen from the corridor, the room behind the wall is no nearer and no farther than the wall.
+    wall = np.array([[2.0, y, 0.0] for y in np.linspace(-3.0, 3.0, 601)])
+    nearer = (wall[::10] - [0.4, 0.0, 0.0]).astype(np.float32)
+    keyframe = replace(KEYFRAME, points_in_body=nearer)
+    here, there = (np.tile([x, 0.0, 0.0], (601, 1)) for x in (-1.0, 1.0))
+    model = model_of()
+    assert model.log_ratio(keyframe, SeenPoints(wall, there), identity()) == 0.0
+    assert model.log_ratio(keyframe, SeenPoints(wall, here), identity()) < -1.0
 
 
 def test_twice_the_beams_are_not_twice_the_evidence() -> None:
@@ -120,7 +157,8 @@ def test_twice_the_beams_are_not_twice_the_evidence() -> None:
 def test_fewer_beams_than_are_independent_count_in_full() -> None:
     model = model_of()
     points = np.array([[2.0, 0.0, 0.0], [0.0, 2.0, 0.0], [-2.0, 0.0, 0.0]], dtype=np.float32)
-    walls = cloud_of(np.array([[2.0, -1, 2, 1], [-1, 2, 1, 2], [-2, -1, -2, 1]], dtype=float))
+    cloud = cloud_of(np.array([[2.0, -1, 2, 1], [-1, 2, 1, 2], [-2, -1, -2, 1]], dtype=float))
+    walls = seen(cloud, identity())
     ratios = [
         model.log_ratio(replace(KEYFRAME, points_in_body=points[:n]), walls, identity())
         for n in (1, 2, 3)
@@ -142,7 +180,7 @@ def test_hit_density_integrates_to_one_at_any_angle() -> None:
     ranges = np.arange(0.0, 40.0, 0.01)
     for bearing in np.radians([90.0, 45.0, 10.0, 4.0]):
         rays = np.tile([np.cos(bearing), np.sin(bearing), 0.0], (len(ranges), 1))
-        density = model._hit_density(ranges, model._expectations(wall, rays))
+        density = model._hit_density(ranges, model._expectations(wall, -wall, rays))
         assert density.sum() * 0.01 == pytest.approx(1.0, abs=0.01)
 
 
@@ -150,7 +188,8 @@ def test_hit_density_integrates_to_one_at_any_angle() -> None:
 def test_ratio_does_not_depend_on_the_frame_of_the_submap(x: float, y: float, yaw: float) -> None:
     moved = planar_pose(x, y, yaw)
     model = model_of(KEYFRAME)
-    found = model.log_ratio(KEYFRAME, transform_points(moved, SUBMAP), moved @ TRUTH)
+    submap = seen(transform_points(moved, SUBMAP.points), moved @ TRUTH)
+    found = model.log_ratio(KEYFRAME, submap, moved @ TRUTH)
     # A point on the border between two cells of the grid may fall to the other side.
     assert found == pytest.approx(model.log_ratio(KEYFRAME, SUBMAP, TRUTH), rel=0.02)
 
@@ -158,7 +197,7 @@ def test_ratio_does_not_depend_on_the_frame_of_the_submap(x: float, y: float, ya
 def test_other_rooms_are_told_apart() -> None:
     model = model_of(KEYFRAME)
     visit = visit_along(SQUARE, [identity()])
-    assert model.log_ratio(KEYFRAME, visit.points, identity()) < 0.5 * model.log_ratio(
+    assert model.log_ratio(KEYFRAME, visit.seen, identity()) < 0.5 * model.log_ratio(
         KEYFRAME, SUBMAP, TRUTH
     )
 
@@ -176,10 +215,12 @@ def test_beams_in_space_are_told_apart_by_elevation() -> None:
     points[:, 2] *= np.where(points[:, 2] > 0.0, 1.0, 0.3)  # a flattened lower half
     pose = planar_pose(3.0, 1.0, 0.5)
     keyframe = replace(KEYFRAME, points_in_body=points.astype(np.float32))
-    right = model.log_ratio(keyframe, transform_points(pose, points), pose)
-    upside_down = points * [1.0, 1.0, -1.0]
+    right, wrong = (
+        model.log_ratio(keyframe, seen(transform_points(pose, cloud), pose), pose)
+        for cloud in (points, points * [1.0, 1.0, -1.0])
+    )
     assert right > 3.0
-    assert model.log_ratio(keyframe, transform_points(pose, upside_down), pose) < 0.7 * right
+    assert wrong < 0.7 * right
 
 
 def test_sensor_away_from_the_centre_is_where_the_rays_start() -> None:
