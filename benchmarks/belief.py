@@ -141,6 +141,13 @@ def _topologies(name: str, worlds: Sequence[WorldBelief]) -> Iterator[Metric]:
     yield Metric(f"{name}/worlds", float(len(worlds)), "1", _HIGHER, 0.0)
     yield Metric(f"{name}/p_true", p_true, "1", _HIGHER, _RIGHT_TOLERANCE)
     yield Metric(f"{name}/map_right", map_right, "1", _HIGHER, _RIGHT_TOLERANCE)
+    alone = [world.alone for world in worlds]
+    right_alone = float(np.mean([each.is_map_right for each in alone]))
+    yield Metric(f"{name}/map_right_alone", right_alone, "1", _HIGHER, None)
+    false_alone = float(sum(each.false_loops for each in alone))
+    yield Metric(f"{name}/false_loops_alone", false_alone, "1", _LOWER, None)
+    cost = sum(each.engine_s for each in alone) / sum(each.engine_alone_s for each in alone)
+    yield Metric(f"{name}/cost_over_alone", cost, "1", _LOWER, None)
     returning = sum(world.placement.returning for world in worlds)
     if returning:
         right = sum(world.placement.right for world in worlds) / returning

@@ -6,6 +6,7 @@ References: own.
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -32,8 +33,27 @@ from hmt_service.core.engine import Engine
 from hmt_service.core.geometry import FloatArray, Pose, identity, inverse
 from hmt_service.core.odometry import Odometry
 from hmt_service.core.stored import StoredMap
-from hmt_service.core.types import EventKind, GlobalMap, Keyframe, MapMethod
+from hmt_service.core.types import Event, EventKind, GlobalMap, Keyframe, MapMethod, Tracking
 from hmt_service.sim.simulation import Instant
+
+
+@dataclass(frozen=True, slots=True)
+class Alone:
+    """What the same engine does with the same odometry if it may keep one hypothesis only."""
+
+    false_loops: int
+    """False loops of its topology at the end."""
+    missed_loops: int
+    """Its missed loops."""
+    engine_s: float
+    """Processor time of the engine with all hypotheses, s."""
+    engine_alone_s: float
+    """The same with one."""
+
+    @property
+    def is_map_right(self) -> bool:
+        """Whether its topology is right."""
+        return not self.false_loops and not self.missed_loops
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +72,8 @@ class WorldBelief:
     """False loops of the most probable topology at the end."""
     missed_loops: int
     """Its missed loops."""
+    alone: Alone
+    """The engine with one hypothesis."""
     placement: Placement
     """How it places the keyframes that return."""
     placement_odometry: Placement
@@ -122,6 +144,10 @@ class _Record:
             tuple(visit.first_keyframe for visit in stored.visits),
         )
 
+    def verdicts(self, stored: StoredMap) -> tuple[Verdict, ...]:
+        """Hold the most probable topology of a map against the truth."""
+        return judge_all(self.journey(stored), topologies_of(stored)[0])
+
 
 def believe(instants: Iterable[Instant], config: Config, *, seed: int = 0) -> WorldBelief:
     """Map what a robot sends, as `hmt run` does, and hold every decision against the truth.
@@ -131,7 +157,10 @@ def believe(instants: Iterable[Instant], config: Config, *, seed: int = 0) -> Wo
         config: Settings of all stages.
         seed: Seed of all randomness of the engine.
     """
-    odometry, engine, record = Odometry(config), Engine(config, seed=seed), _Record()
+    particles = config.particles.model_copy(update={"budget": 1})
+    alone = _TimedEngine(config.model_copy(update={"particles": particles}), seed)
+    timed, odometry, record = _TimedEngine(config, seed), Odometry(config), _Record()
+    engine = timed.engine
     for instant in instants:
         for reading in instant.readings:
             tracking = odometry.process(reading)
@@ -139,15 +168,38 @@ def believe(instants: Iterable[Instant], config: Config, *, seed: int = 0) -> Wo
                 continue
             if tracking.keyframe is not None:
                 record.add_keyframe(instant)
-            events = engine.process(tracking)
+            alone.process(tracking)
+            events = timed.process(tracking)
             if any(event.kind is EventKind.AREA_ENTERED for event in events):
                 stored = engine.stored()
                 record.add_decisions(stored, len(stored.visits) - 1)
     engine.finish()
+    alone.engine.finish()
     stored = engine.stored()
     record.add_decisions(stored, len(stored.visits))
     built = engine.global_map(MapMethod.CONSISTENT, with_points=False)
-    return _belief(stored, built, record, is_planar=config.sensor.is_planar)
+    verdicts = record.verdicts(alone.engine.stored())
+    beside = Alone(
+        false_loops=verdicts.count(Verdict.FALSE_LOOP),
+        missed_loops=verdicts.count(Verdict.MISSED_LOOP),
+        engine_s=timed.spent_s,
+        engine_alone_s=alone.spent_s,
+    )
+    return _belief(stored, built, record, beside, is_planar=config.sensor.is_planar)
+
+
+class _TimedEngine:
+    """An engine, and the processor time that it takes for trackings."""
+
+    def __init__(self, config: Config, seed: int) -> None:
+        self.engine = Engine(config, seed=seed)
+        self.spent_s = 0.0
+
+    def process(self, tracking: Tracking) -> tuple[Event, ...]:
+        started_s = time.process_time()
+        events = self.engine.process(tracking)
+        self.spent_s += time.process_time() - started_s
+        return events
 
 
 def topologies_of(stored: StoredMap) -> tuple[Topology, ...]:
@@ -165,7 +217,7 @@ def topologies_of(stored: StoredMap) -> tuple[Topology, ...]:
 
 
 def _belief(
-    stored: StoredMap, built: GlobalMap, record: _Record, *, is_planar: bool
+    stored: StoredMap, built: GlobalMap, record: _Record, alone: Alone, *, is_planar: bool
 ) -> WorldBelief:
     journey, topologies = record.journey(stored), topologies_of(stored)
     verdicts = [judge_all(journey, topology) for topology in topologies]
@@ -183,6 +235,7 @@ def _belief(
         true_returns=sum(is_true_return(journey, visit) for visit in visits),
         false_loops=verdicts[0].count(Verdict.FALSE_LOOP),
         missed_loops=verdicts[0].count(Verdict.MISSED_LOOP),
+        alone=alone,
         placement=placement(journey, _poses(topologies[0], journey)),
         placement_odometry=placement(journey, _chained(stored.keyframes)),
         decisions=tuple(record.decisions),

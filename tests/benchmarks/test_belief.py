@@ -13,7 +13,7 @@ from matplotlib.image import imread
 from benchmarks.belief import report_of
 from benchmarks.calibration import score
 from benchmarks.scoring import Decision, Option, Placement, always_new, decide
-from benchmarks.world_belief import WorldBelief
+from benchmarks.world_belief import Alone, WorldBelief
 from tests.benchmarks.test_scoring import ALL_NEW, RING, TRUTH, topology
 
 VISITS = range(1, 6)
@@ -50,6 +50,7 @@ def world(
         true_returns=returns,
         false_loops=false_loops,
         missed_loops=missed_loops,
+        alone=Alone(false_loops=0, missed_loops=1, engine_s=3.0, engine_alone_s=2.0),
         placement=Placement(10, 10 if is_right else 4),
         placement_odometry=Placement(10, 5),
         decisions=tuple(decisions),
@@ -106,6 +107,8 @@ def test_the_numbers_of_a_report(tmp_path: Path) -> None:
     assert values["all/worlds"] == 2
     assert values["all/p_true"] == pytest.approx(0.45)
     assert values["all/map_right"] == 0.5
+    assert values["all/map_right_alone"] == 0.0
+    assert values["all/cost_over_alone"] == pytest.approx(1.5)
     assert values["all/true_returns"] == 4
     assert values["all/missed_loops"] == 1
     assert values["all/missed_loops_per_return"] == 0.25

@@ -46,6 +46,10 @@ def test_a_ring_that_is_closed_is_right() -> None:
     belief = closed_ring()
     assert belief.is_map_right
     assert belief.p_true > 0.99
+    # Nothing here is ambiguous for long: one hypothesis finds it too.
+    assert belief.alone.is_map_right
+    assert belief.alone.engine_s > 0.0
+    assert belief.alone.engine_alone_s > 0.0
     assert belief.true_returns >= 2
     assert len(belief.decisions) == len(belief.decisions_always_new) == belief.visits - 1
     assert score(belief.decisions).log_loss < 0.01
