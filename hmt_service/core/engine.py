@@ -38,7 +38,7 @@ from hmt_service.core.stored import (
     StoredVisit,
 )
 from hmt_service.core.submap import Visit, as_points, visit_of
-from hmt_service.core.transition import Successor, Transition
+from hmt_service.core.transition import SAME_AREA, Successor, Transition
 from hmt_service.core.types import (
     NO_POINTS,
     ArcResidual,
@@ -257,7 +257,7 @@ class Engine:
                 child = hypothesis.recognising(
                     match.area,
                     place,
-                    is_same_area=match.overlap >= _SAME_AREA,
+                    is_same_area=match.overlap >= SAME_AREA,
                     hypothesis=self._new_identifier(),
                     log_weight=hypothesis.log_weight + match.log_factor,
                 )
@@ -553,8 +553,6 @@ class Engine:
 
 
 _ANY_CUT = 2.0
-# A visit was to an area, and did not only see into it, if the area explains so much of it.
-_SAME_AREA = 2.0 / 3.0
 # A gap that the wheels bridge so well is none.
 _BRIDGED_M = 0.25
 

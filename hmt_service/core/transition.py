@@ -32,6 +32,8 @@ from hmt_service.core.visits import Visits, gaps_m
 
 # So many times as many areas are looked at as may be candidates.
 _ASKED = 4
+SAME_AREA = 2.0 / 3.0
+"""A visit was to an area, and did not only see into it, if the area explains so much of it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,6 +77,8 @@ class Transition:
         """
         self._config = config.transition
         self._refinement = config.refinement
+        self._observations = config.observation
+        self._sigma_submap_m = config.covariance.sigma_submap_m
         self._gate_sigma = config.alignment.gate_sigma
         self._axes = PLANAR_AXES if config.sensor.is_planar else np.arange(6)
         self._aligner = aligner
@@ -98,7 +102,10 @@ class Transition:
         candidates = self._candidates(hypothesis, visit, arc.visit_a, arc.a_from_b, visits)
         outside = self._mass_outside(candidates, visit, visits)
         new = Successor(None, None, 0.0, float(np.log(outside)))
-        return (new, *self._matches(visit, candidates, visits))
+        # Who only sees into the area that he was in has left it.
+        here = hypothesis.current.area
+        matches = self._matches(visit, candidates, visits)
+        return (new, *(m for m in matches if m.area != here or m.overlap >= SAME_AREA))
 
     def recognitions(
         self, hypothesis: Hypothesis, visit: Visit, visits: Visits
@@ -212,9 +219,20 @@ class Transition:
                 visit.keyframes, visit.visit_from_keyframe, visit.novelty, strict=True
             )
         )
-        return log_ratio + self._log_prior(prior, mode)
+        return log_ratio + self._log_prior(prior, mode, self._widening(visit, mode))
 
-    def _log_prior(self, prior: GaussianPose, mode: Mode) -> float:
+    def _widening(self, visit: Visit, mode: Mode) -> float:
+        """Return how much wider, as a variance, the likelihood is than the registration.
+
+        The registration takes each point for an independent reading; the observation model knows
+        better, and how far off a range may be.
+        """
+        observation = self._observations
+        readings = observation.independent_beams * sum(visit.novelty)
+        wider = (observation.hit_sigma_m / self._sigma_submap_m) ** 2
+        return max(1.0, mode.overlap * len(visit.sweep.points) / readings * wider)
+
+    def _log_prior(self, prior: GaussianPose, mode: Mode, widening: float) -> float:
         """Return log of N(x*; prior) times the volume of the mode.
 
         With a likelihood peak of shape N(x; x*, S), where x* is itself known with covariance B
@@ -222,9 +240,11 @@ class Transition:
         sqrt(|S| / |P + B + S|) exp(-1/2 (x* - m)' (P + B + S)^-1 (x* - m)) times its height.
         """
         block, pose = np.ix_(self._axes, self._axes), mode.target_from_visit
-        together: FloatArray = prior.covariance[block] + pose.covariance[block]
+        width = widening * mode.width[block]
+        bend = pose.covariance[block] - mode.width[block]
+        together: FloatArray = prior.covariance[block] + bend + width
         gap = log(inverse(prior.mean) @ pose.mean)[self._axes]
-        _, log_volume = np.linalg.slogdet(mode.width[block])
+        _, log_volume = np.linalg.slogdet(width)
         _, log_prior_volume = np.linalg.slogdet(together)
         return float(
             0.5 * (log_volume - log_prior_volume) - 0.5 * gap @ np.linalg.solve(together, gap)
