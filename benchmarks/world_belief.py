@@ -159,6 +159,7 @@ def believe(instants: Iterable[Instant], config: Config, *, seed: int = 0) -> Wo
     """
     particles = config.particles.model_copy(update={"budget": 1})
     alone = _TimedEngine(config.model_copy(update={"particles": particles}), seed)
+    trackings = []
     timed, odometry, record = _TimedEngine(config, seed), Odometry(config), _Record()
     engine = timed.engine
     for instant in instants:
@@ -168,12 +169,15 @@ def believe(instants: Iterable[Instant], config: Config, *, seed: int = 0) -> Wo
                 continue
             if tracking.keyframe is not None:
                 record.add_keyframe(instant)
-            alone.process(tracking)
+            trackings.append(tracking)
             events = timed.process(tracking)
             if any(event.kind is EventKind.AREA_ENTERED for event in events):
                 stored = engine.stored()
                 record.add_decisions(stored, len(stored.visits) - 1)
     engine.finish()
+    # One engine after the other: submaps that are ready to be used are shared by all in a process.
+    for tracking in trackings:
+        alone.process(tracking)
     alone.engine.finish()
     stored = engine.stored()
     record.add_decisions(stored, len(stored.visits))

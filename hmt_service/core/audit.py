@@ -72,7 +72,7 @@ def belief_of(posterior: Posterior) -> Belief:
 
 
 def between(beliefs: Sequence[Belief], start_s: float, end_s: float) -> tuple[Belief, ...]:
-    """Return what was believed in an interval: what held at its ends is put there."""
+    """Return which of some beliefs, in order of time, hold in an interval: also at its ends."""
     known = [belief for belief in beliefs if belief.stamp_s <= end_s]
     before = [belief for belief in known if belief.stamp_s < start_s]
     inside = known[len(before) :]

@@ -107,7 +107,8 @@ class CovarianceConfig(Section):
     """A direction that a scan alone knows less well than this is left to the motion prior."""
     uneven_motion_share: float = Field(default=0.2, ge=0.0)
     """Standard deviation of the pose of a sweep because its motion is not uniform: as a share of
-    the change of motion since the sweep before. Fitted in simulated worlds."""
+    the change of motion since the sweep before, or from what was predicted. Fitted in simulated
+    worlds."""
     sigma_submap_m: float = Field(default=0.04, gt=0.0)
     """Standard deviation of one residual between two submaps, which share surfaces only roughly;
     how far they are bent is known of each visit and comes on top."""

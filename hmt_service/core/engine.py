@@ -278,12 +278,8 @@ class Engine:
             for successor in successors:
                 # One successor is no branch: what was believed goes on.
                 is_branch = len(successors) > 1
-                child = hypothesis.extended(
-                    _assignment(visit.visit, successor),
-                    arc,
-                    hypothesis=self._new_identifier() if is_branch else hypothesis.hypothesis,
-                    log_weight=hypothesis.log_weight + successor.log_factor,
-                )
+                identifier = self._new_identifier() if is_branch else hypothesis.hypothesis
+                child = _entered(hypothesis, visit.visit, arc, successor, identifier)
                 expanded.append(child)
                 if is_branch:
                     branched.append(audit.branched(hypothesis, child, successor, stamp_s))
@@ -567,10 +563,23 @@ def _said_of(tracking: Tracking) -> list[str]:
     return said
 
 
-def _assignment(visit: int, successor: Successor) -> Assignment:
-    if successor.area is None:
-        return Assignment(visit, visit, None)
-    return Assignment(visit, successor.area, successor.area_from_visit)
+def _entered(
+    hypothesis: Hypothesis, visit: int, arc: Factor, successor: Successor, identifier: int
+) -> Hypothesis:
+    """Return a hypothesis that goes on with a visit where a successor says."""
+    area, place = successor.area, successor.area_from_visit
+    log_weight = hypothesis.log_weight + successor.log_factor
+    new = Assignment(visit, visit, None)
+    if area is None or place is None:
+        return hypothesis.extended(new, arc, hypothesis=identifier, log_weight=log_weight)
+    # Who only sees into the area that he was in has left it.
+    if area == hypothesis.current.area and successor.overlap < SAME_AREA:
+        entered = hypothesis.extended(new, arc, hypothesis=identifier, log_weight=log_weight)
+        return entered.recognising(
+            area, place, is_same_area=False, hypothesis=identifier, log_weight=log_weight
+        )
+    known = Assignment(visit, area, place)
+    return hypothesis.extended(known, arc, hypothesis=identifier, log_weight=log_weight)
 
 
 def _means(placed: GlobalMap) -> Mapping[int, Pose]:

@@ -323,13 +323,13 @@ class PoseGraph:
         shared = GaussianPose(known.mean, max(len(arcs), 1) * known.covariance)
         for (first, second), visit_from_other in arcs.items():
             other = second if first == visit else first
-            self._fuse(Factor(anchor, other, shared @ visit_from_other))
+            self.fuse_factor(Factor(anchor, other, shared @ visit_from_other))
         for key in (*arcs, _key(visit, anchor)):
             del self._factors[key]
             self._pending.pop(key, None)
             self._removed = (*self._removed, key)
 
-    def _fuse(self, factor: Factor) -> None:
+    def fuse_factor(self, factor: Factor) -> None:
         """Add an arc to what is known of the same two visits by other observations."""
         key = _key(factor.visit_a, factor.visit_b)
         a_from_b = _between(factor, key[0])

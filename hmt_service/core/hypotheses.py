@@ -140,7 +140,7 @@ class Hypothesis:
         graph = self.graph.copy()
         graph.add_factor(arc)
         if assignment.area_from_visit is not None:
-            graph.add_factor(Factor(assignment.area, assignment.visit, assignment.area_from_visit))
+            graph.fuse_factor(Factor(assignment.area, assignment.visit, assignment.area_from_visit))
         topology = self.topology.with_visit(assignment)
         return Hypothesis(hypothesis, log_weight, topology, graph, self.unlikely_for)
 
@@ -163,7 +163,7 @@ class Hypothesis:
             log_weight: Its log weight, not normalised.
         """
         visit, topology, graph = self.current.visit, self.topology, self.graph.copy()
-        graph.add_factor(Factor(area, visit, area_from_visit))
+        graph.fuse_factor(Factor(area, visit, area_from_visit))
         if is_same_area:
             topology = topology.with_visit(Assignment(visit, area, area_from_visit))
         return Hypothesis(hypothesis, log_weight, topology, graph, self.unlikely_for)
@@ -259,7 +259,11 @@ class ParticleLayer:
         kept = [h for h in given if np.exp(h.log_weight) >= self._negligible_mass]
         if len(kept) > self._budget:
             weights = np.exp([h.log_weight for h in kept])
-            survivors = optimal_resampling(weights / weights.sum(), self._budget, self._rng)
+            weights /= weights.sum()
+            # Who may keep only one wants the best, not a fair draw.
+            best = [(int(np.argmax(weights)), 1.0)]
+            several = self._budget > 1
+            survivors = optimal_resampling(weights, self._budget, self._rng) if several else best
             kept = [replace(kept[i], log_weight=float(np.log(weight))) for i, weight in survivors]
         identifiers = {h.hypothesis for h in kept}
         self._hypotheses = tuple(

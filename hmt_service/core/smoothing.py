@@ -221,13 +221,14 @@ def _alignments(hypothesis: Hypothesis, visits: Sequence[Visit]) -> list[Factor]
 
     Where the odometry was lost between two visits, nothing else says where the second is.
     """
+    lost = {visit.visit for visit in visits if visit.keyframes[0].failure is not None}
     sizes = [len(visit.keyframes) for visit in visits]
     firsts = np.concatenate([[0], np.cumsum(sizes[:-1])]).tolist()
     first_of = {visit.visit: first for visit, first in zip(visits, firsts, strict=True)}
     return [
         Factor(first_of[factor.visit_a], first_of[factor.visit_b], factor.a_from_b)
         for factor in hypothesis.graph.factors
-        if factor.visit_b != factor.visit_a + 1
+        if factor.visit_b != factor.visit_a + 1 or factor.visit_b in lost
     ]
 
 

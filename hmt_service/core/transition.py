@@ -102,10 +102,7 @@ class Transition:
         candidates = self._candidates(hypothesis, visit, arc.visit_a, arc.a_from_b, visits)
         outside = self._mass_outside(candidates, visit, visits)
         new = Successor(None, None, 0.0, float(np.log(outside)))
-        # Who only sees into the area that he was in has left it.
-        here = hypothesis.current.area
-        matches = self._matches(visit, candidates, visits)
-        return (new, *(m for m in matches if m.area != here or m.overlap >= SAME_AREA))
+        return (new, *self._matches(visit, candidates, visits))
 
     def recognitions(
         self, hypothesis: Hypothesis, visit: Visit, visits: Visits

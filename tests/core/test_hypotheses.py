@@ -122,6 +122,26 @@ def test_resampling_keeps_the_budget_and_the_heavy_ones_exactly(
     assert max(lost) <= lightest * (1.0 + 1e-9)
 
 
+@given(seed=st.integers(0, 99))
+def test_who_may_keep_only_one_keeps_the_best(seed: int) -> None:
+    layer = layer_of(0.3, 0.5, 0.2, budget=1, seed=seed)
+    assert [h.hypothesis for h in layer.hypotheses] == [1]
+    assert layer.probabilities == pytest.approx([1.0])
+
+
+def test_where_a_visit_is_in_the_area_just_left_adds_to_how_the_robot_went() -> None:
+    before = travelled()
+    visit = before.current.visit
+    motion = Factor(visit, visit + 1, gaussian(planar_pose(1.0, 0.0, 0.0), sigma_m=0.4))
+    place = gaussian(planar_pose(1.4, 0.0, 0.0), sigma_m=0.4)
+    after = before.extended(
+        Assignment(visit + 1, visit, place), motion, hypothesis=9, log_weight=0.0
+    )
+    found = after.graph.relative(visit, visit + 1)
+    assert found.mean[0, 3] == pytest.approx(1.2, abs=1e-3)
+    assert found.sigma_m == pytest.approx(0.4 / np.sqrt(2.0), rel=0.01)
+
+
 def test_threshold_has_a_known_value() -> None:
     # sum(min(w / k, 1)) = 2 for k = 0.4: only the first is heavier, the rest are worth 0.4 / 0.4.
     weights = np.array([0.6, 0.2, 0.1, 0.1])
