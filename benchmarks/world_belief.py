@@ -144,7 +144,7 @@ class _Record:
             tuple(visit.first_keyframe for visit in stored.visits),
         )
 
-    def verdicts(self, stored: StoredMap) -> tuple[Verdict, ...]:
+    def verdicts_on(self, stored: StoredMap) -> tuple[Verdict, ...]:
         """Hold the most probable topology of a map against the truth."""
         return judge_all(self.journey(stored), topologies_of(stored)[0])
 
@@ -182,7 +182,7 @@ def believe(instants: Iterable[Instant], config: Config, *, seed: int = 0) -> Wo
     stored = engine.stored()
     record.add_decisions(stored, len(stored.visits))
     built = engine.global_map(MapMethod.CONSISTENT, with_points=False)
-    verdicts = record.verdicts(alone.engine.stored())
+    verdicts = record.verdicts_on(alone.engine.stored())
     beside = Alone(
         false_loops=verdicts.count(Verdict.FALSE_LOOP),
         missed_loops=verdicts.count(Verdict.MISSED_LOOP),

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from functools import partial
 
 import numpy as np
 
@@ -567,19 +568,17 @@ def _entered(
     hypothesis: Hypothesis, visit: int, arc: Factor, successor: Successor, identifier: int
 ) -> Hypothesis:
     """Return a hypothesis that goes on with a visit where a successor says."""
-    area, place = successor.area, successor.area_from_visit
+    area, place, new = successor.area, successor.area_from_visit, Assignment(visit, visit, None)
     log_weight = hypothesis.log_weight + successor.log_factor
-    new = Assignment(visit, visit, None)
+    extended = partial(hypothesis.extended, arc=arc, hypothesis=identifier, log_weight=log_weight)
     if area is None or place is None:
-        return hypothesis.extended(new, arc, hypothesis=identifier, log_weight=log_weight)
+        return extended(new)
+    if area != hypothesis.current.area or successor.overlap >= SAME_AREA:
+        return extended(Assignment(visit, area, place))
     # Who only sees into the area that he was in has left it.
-    if area == hypothesis.current.area and successor.overlap < SAME_AREA:
-        entered = hypothesis.extended(new, arc, hypothesis=identifier, log_weight=log_weight)
-        return entered.recognising(
-            area, place, is_same_area=False, hypothesis=identifier, log_weight=log_weight
-        )
-    known = Assignment(visit, area, place)
-    return hypothesis.extended(known, arc, hypothesis=identifier, log_weight=log_weight)
+    return extended(new).recognising(
+        area, place, is_same_area=False, hypothesis=identifier, log_weight=log_weight
+    )
 
 
 def _means(placed: GlobalMap) -> Mapping[int, Pose]:

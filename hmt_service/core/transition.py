@@ -77,7 +77,7 @@ class Transition:
         """
         self._config = config.transition
         self._refinement = config.refinement
-        self._observations = config.observation
+        self._beams = config.observation
         self._sigma_submap_m = config.covariance.sigma_submap_m
         self._gate_sigma = config.alignment.gate_sigma
         self._axes = PLANAR_AXES if config.sensor.is_planar else np.arange(6)
@@ -207,14 +207,10 @@ class Transition:
         """Return the log of the Laplace integral of prior times likelihood around one mode."""
         # The peak of prior times likelihood; along a corridor only the prior says where that is.
         peak = prior.fuse(mode.target_from_visit).mean
+        poses = [peak @ pose.mean for pose in visit.visit_from_keyframe]
         log_ratio = sum(
-            novelty
-            * self._observation.log_ratio(
-                keyframe, target.known_from((peak @ pose.mean)[:3, 3]), peak @ pose.mean
-            )
-            for keyframe, pose, novelty in zip(
-                visit.keyframes, visit.visit_from_keyframe, visit.novelty, strict=True
-            )
+            novelty * self._observation.log_ratio(keyframe, target.known_from(pose[:3, 3]), pose)
+            for keyframe, pose, novelty in zip(visit.keyframes, poses, visit.novelty, strict=True)
         )
         return log_ratio + self._log_prior(prior, mode, self._widening(visit, mode))
 
@@ -224,9 +220,8 @@ class Transition:
         The registration takes each point for an independent reading; the observation model knows
         better, and how far off a range may be.
         """
-        observation = self._observations
-        readings = observation.independent_beams * sum(visit.novelty)
-        wider = (observation.hit_sigma_m / self._sigma_submap_m) ** 2
+        readings = self._beams.independent_beams * sum(visit.novelty)
+        wider = (self._beams.hit_sigma_m / self._sigma_submap_m) ** 2
         return max(1.0, mode.overlap * len(visit.sweep.points) / readings * wider)
 
     def _log_prior(self, prior: GaussianPose, mode: Mode, widening: float) -> float:

@@ -144,19 +144,24 @@ def test_mass_of_a_new_area_is_never_nothing_and_never_all(sigma_m: float) -> No
 
 def test_unlikely_pose_counts_less() -> None:
     hypothesis, visits = explored(IN_ROOM, IN_OTHER)
-    motion = inverse(IN_OTHER[0]) @ IN_ROOM[0]
-    factors = [
-        successors_of(hypothesis, visits, IN_ROOM, motion @ planar_pose(x, 0, 0), sigma_m=0.3)[
-            1
-        ].log_factor
-        for x in (0.0, 0.6)
-    ]
+    motion, gap_m = inverse(IN_OTHER[0]) @ IN_ROOM[0], 0.6
+    likely, unlikely = (
+        successors_of(hypothesis, visits, IN_ROOM, motion @ planar_pose(x, 0, 0), sigma_m=0.3)[1]
+        for x in (0.0, gap_m)
+    )
+    assert likely.area_from_visit is not None
     # The rest is the same: only the prior's exponent differs. The variance along x is that of both
-    # arcs, of the lever of 20 m and of the likelihood, a little over that of one range; the gap is
-    # 0.6 m.
-    prior_m2, hit_m = 0.3**2 + 0.1**2, CONFIG.observation.hit_sigma_m
-    widest, narrowest = (0.5 * 0.6**2 / (prior_m2 + w**2) for w in (1.3 * hit_m, 0.5 * hit_m))
-    assert widest < factors[0] - factors[1] < narrowest
+    # arcs, of how far the submaps are bent, and of the likelihood: the registration's, widened to
+    # what `independent_beams` ranges say that are good to `hit_sigma_m`.
+    visit = visit_along(WORLD, IN_ROOM, visit=2)
+    observed, points = CONFIG.observation, len(visit.sweep.points)
+    mode = Aligner(CONFIG).modes(visit, visits[0], GaussianPose(identity(), 0.1 * np.eye(6)))[0]
+    readings = observed.independent_beams * sum(visit.novelty)
+    wider = points / readings * (observed.hit_sigma_m / CONFIG.covariance.sigma_submap_m) ** 2
+    bend = mode.target_from_visit.covariance - mode.width
+    together = (0.3**2 + 0.1**2) + bend[3, 3] + wider * mode.width[3, 3]
+    expected = 0.5 * gap_m**2 / together
+    assert likely.log_factor - unlikely.log_factor == pytest.approx(expected, rel=0.05)
 
 
 def test_same_seed_gives_the_same_factors() -> None:
