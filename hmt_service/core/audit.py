@@ -166,6 +166,14 @@ def accepted(best: Hypothesis, stamp_s: float) -> Event:
     return Event(EventKind.ACCEPTED, stamp_s, message, numbers)
 
 
+def recognised(visit: int, best: Hypothesis, stamp_s: float) -> Event:
+    """Return that a visit to a new area, as all of it shows, was to a known one."""
+    area = best.topology.assignments[visit].area
+    numbers = {"hypothesis": float(best.hypothesis), "visit": float(visit), "area": float(area)}
+    message = f"area {visit} is area {area}: that explains what was seen"
+    return Event(EventKind.ACCEPTED, stamp_s, message, numbers)
+
+
 def lost(keyframe: Keyframe, failure: TrackingFailure, registration: Registration | None) -> Event:
     """Return that a keyframe was not registered."""
     numbers = {

@@ -24,7 +24,13 @@ from hmt_service.core.composition import arcs_of, compose_shortest_paths, residu
 from hmt_service.core.config import Config
 from hmt_service.core.geometry import FloatArray, GaussianPose, Pose, inverse, log
 from hmt_service.core.graph import Factor, PoseGraph
-from hmt_service.core.hypotheses import Assignment, Hypothesis, ParticleLayer, Topology
+from hmt_service.core.hypotheses import (
+    SAME_AREA,
+    Assignment,
+    Hypothesis,
+    ParticleLayer,
+    Topology,
+)
 from hmt_service.core.kernels import compile_kernels
 from hmt_service.core.observation import ObservationModel
 from hmt_service.core.plausibility import Plausibility
@@ -39,7 +45,7 @@ from hmt_service.core.stored import (
     StoredVisit,
 )
 from hmt_service.core.submap import Visit, as_points, visit_of
-from hmt_service.core.transition import SAME_AREA, Successor, Transition
+from hmt_service.core.transition import Successor, Transition
 from hmt_service.core.types import (
     NO_POINTS,
     ArcResidual,
@@ -181,21 +187,22 @@ class Engine:
         Returns:
             What was decided.
         """
+        refined: tuple[Event, ...] = ()
         if self._revision > self._finished_revision:
-            self._refine(self._open)
+            refined = self._audited(self._refine(self._open, self._open.keyframes[-1].stamp_s))
             self._revision += 1
             self._finished_revision = self._revision
         if is_urgent or not self._visits or self._smooth_poses() is not None:
-            return ()
-        events = self._audited(self._recognise(self._open, self._open.keyframes[-1].stamp_s))
-        if events:
+            return refined
+        recognised = self._audited(self._recognise(self._open, self._open.keyframes[-1].stamp_s))
+        if recognised:
             self._revision += 1
             self._finished_revision = self._revision
         self._smoothed = (
             self._revision,
             self._smoother.smooth(self._particles.best, self._visits),
         )
-        return events
+        return (*refined, *recognised)
 
     def _smooth_poses(self) -> FloatArray | None:
         """Return the smoothed poses of all keyframes, unless the map has changed since."""
@@ -221,10 +228,10 @@ class Engine:
         closed, opened, motion = visit.split(first_of_new)
         self._visits.put(closed)
         self._unweigh(opened.keyframes)
-        self._refine(closed)
         stamp_s = opened.keyframes[-1].stamp_s
+        refined = self._refine(closed, stamp_s)
         merged = audit.pruned(self._particles.merge(), stamp_s, "merged")
-        recognised = (*merged, *self._forget(stamp_s), *self._recognise(closed, stamp_s))
+        recognised = (*refined, *merged, *self._forget(stamp_s), *self._recognise(closed, stamp_s))
         self._forget_visit(closed.visit - 1)
         arc = Factor(closed.visit, opened.visit, motion)
         self._motions.append(arc)
@@ -331,14 +338,19 @@ class Engine:
             self._visits.forget(visit)
             self._particles.replace([h.without(visit) for h in hypotheses])
 
-    def _refine(self, visit: Visit) -> None:
+    def _refine(self, visit: Visit, stamp_s: float) -> tuple[Event, ...]:
         """Let every hypothesis use all of a visit that is over, not only its beginning."""
+        was_new = visit.visit in self._particles.best.topology.areas
         self._particles.replace(
             [
                 self._refinement.refine(hypothesis, visit, self._visits)
                 for hypothesis in self._particles.hypotheses
             ]
         )
+        best = self._particles.best
+        if not was_new or visit.visit in best.topology.areas:
+            return ()
+        return (audit.recognised(visit.visit, best, stamp_s),)
 
     def _new_identifier(self) -> int:
         self._next_hypothesis += 1

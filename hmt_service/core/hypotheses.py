@@ -32,6 +32,8 @@ from hmt_service.core.graph import Factor, PoseGraph
 from hmt_service.core.submap import Visit
 from hmt_service.core.types import Belief, HypothesisSummary
 
+SAME_AREA = 2.0 / 3.0
+"""A visit was to an area, and did not only see into it, if the area explains so much of it."""
 # Maps that differ by no more than this anywhere are the same.
 _EQUAL_M, _EQUAL_RAD = 0.1, 0.03
 

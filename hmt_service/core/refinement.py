@@ -1,7 +1,8 @@
 """Refinement of a visit that is over: its place in its area, and arcs to all that it overlaps.
 
-Nothing topological is decided here: a pair of visits is tied only where the hypothesis' own graph
-already says, with little doubt, that they have seen the same space.
+Where a visit is, is not decided here: a pair of visits is tied only where the hypothesis' own graph
+already says, with little doubt, that they have seen the same space. Only then a visit to a new area
+may turn out to be one to a known area, which explains what the rest of the visit has seen.
 
 References:
     Blanco et al. 2008, section V (local maps are fused once the topology is settled).
@@ -15,7 +16,7 @@ from hmt_service.core.alignment import Aligner, Mode
 from hmt_service.core.config import Config, RefinementConfig
 from hmt_service.core.geometry import GaussianPose
 from hmt_service.core.graph import Factor
-from hmt_service.core.hypotheses import Hypothesis
+from hmt_service.core.hypotheses import SAME_AREA, Assignment, Hypothesis
 from hmt_service.core.submap import Visit
 from hmt_service.core.visits import Visits, gaps_m
 
@@ -72,6 +73,10 @@ class Refinement:
             graph.add_factor(Factor(other, visit.visit, tie))
             if other == founder:
                 assignment = replace(assignment, area_from_visit=mode.target_from_visit)
+        if founder == visit.visit:
+            area, mode = max(ties, key=lambda tie: tie[1].overlap)
+            if mode.overlap >= SAME_AREA:
+                assignment = Assignment(visit.visit, area, mode.target_from_visit)
         topology = hypothesis.topology.with_visit(assignment)
         return replace(hypothesis, graph=graph, topology=topology)
 

@@ -32,8 +32,6 @@ from hmt_service.core.visits import Visits, gaps_m
 
 # So many times as many areas are looked at as may be candidates.
 _ASKED = 4
-SAME_AREA = 2.0 / 3.0
-"""A visit was to an area, and did not only see into it, if the area explains so much of it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

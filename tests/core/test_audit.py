@@ -5,12 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hmt_service.core.audit import Audit, between
+from hmt_service.core.alignment import Aligner
+from hmt_service.core.audit import Audit, between, recognised
 from hmt_service.core.config import load_config
 from hmt_service.core.engine import Engine
 from hmt_service.core.odometry import Odometry
+from hmt_service.core.refinement import Refinement
 from hmt_service.core.types import Belief, Event, EventKind
+from hmt_service.core.visits import Visits
 from tests.core.factories import RING, drifting, drive, ring_path
+from tests.core.test_refinement import VISITS, believed
 
 
 def belief(stamp_s: float, **areas: float) -> Belief:
@@ -83,3 +87,14 @@ def test_beliefs_end_with_the_posterior(engine: Engine) -> None:
     assert last.current_area == snapshot.posterior.current_area
     assert last.effective_sample_size == snapshot.posterior.effective_sample_size
     assert all(sum(b.current_area.values()) == pytest.approx(1.0) for b in engine.audit.beliefs)
+
+
+def test_a_new_area_that_turns_out_to_be_a_known_one_is_said_to_be() -> None:
+    config = load_config()
+    refined = Refinement(config, Aligner(config)).refine(
+        believed(), VISITS[2], Visits(VISITS.values())
+    )
+    event = recognised(2, refined, 7.0)
+    assert event.kind is EventKind.ACCEPTED
+    assert event.numbers == {"hypothesis": 0.0, "visit": 2.0, "area": 0.0}
+    assert "area 2 is area 0" in event.message

@@ -86,13 +86,32 @@ def test_what_is_refined_is_not_changed() -> None:
     assert hypothesis.graph.pose(2).tolist() == before
 
 
-def test_topology_is_not_decided_here() -> None:
+def test_visit_that_an_area_explains_was_to_that_area() -> None:
     hypothesis = believed()
     result = refined(hypothesis)
     assert is_tied(result, 0, 2)
-    assert result.topology.path == hypothesis.topology.path == (0, 1, 2)
-    assert result.topology.assignments[2].area_from_visit is None
+    assert hypothesis.topology.path == (0, 1, 2)
+    assert result.topology.path == (0, 1, 0)
+    aligned = result.topology.assignments[2].area_from_visit
+    assert aligned is not None
+    assert np.abs(log(inverse(TRUTH) @ aligned.mean)).max() < 0.01
     assert result.log_weight == hypothesis.log_weight
+
+
+def test_visit_that_sees_into_an_area_was_not_to_it() -> None:
+    # Only the left and the lower wall are those of the small room.
+    pillar = box(-2.5, 0.8, -1.8, 1.5)
+    small = np.concatenate([box(-4.0, -2.0, 4.0, 2.0), pillar])
+    large = np.concatenate([box(-4.0, -2.0, 9.0, 5.0), pillar])
+    visits = {
+        **VISITS,
+        0: visit_along(small, line(STARTS[0], length_m=1.5), visit=0),
+        2: visit_along(large, line(STARTS[2], length_m=1.5), visit=2),
+    }
+    result = refined(believed(), visits)
+    assert is_tied(result, 0, 2)
+    assert result.topology.path == (0, 1, 2)
+    assert result.topology.assignments[2].area_from_visit is None
 
 
 def test_alignment_with_its_own_area_is_replaced_by_the_better_one() -> None:
