@@ -41,6 +41,8 @@ _NEAR_INFORMATION = isotropic_covariance(sigma_rad=1.0 / _BASIN_RAD, sigma_m=1.0
 # A guess is looked at from above, then with so few points, and dropped if that explains less than
 # these shares of the overlap that is asked for.
 _FEW_POINTS, _FROM_ABOVE, _AT_A_GLANCE = 200, 0.75, 0.85
+# So many points or a few more are searched for: the floor of a garage alone is ten times as many.
+_SEARCHED_POINTS = 5_000
 # Searches are so much wider than asked for: the next hypothesis asks for almost the same.
 _MARGIN_M, _MARGIN_RAD = 1.0, 0.05
 SEPARATION_M, SEPARATION_RAD = 0.6, 0.15
@@ -223,9 +225,10 @@ class Aligner:
         """Return the best poses on a raster, seen from above; height and tilt are the region's."""
         yaw = yaw_of(region.mean)
         upright = planar_pose(0.0, 0.0, -yaw)[:3, :3] @ region.mean[:3, :3]
+        searched = slice(None, None, max(len(visit.points) // _SEARCHED_POINTS, 1))
         peaks = target.view.best_peaks(
-            (visit.points - visit.centre) @ upright.T,
-            visit.seen.directions @ upright.T,
+            (visit.points[searched] - visit.centre) @ upright.T,
+            visit.seen.directions[searched] @ upright.T,
             middle=region.centre[:2],
             yaw=yaw,
             reach_m=region.reach_m,
