@@ -14,6 +14,7 @@ import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 import psutil
@@ -66,9 +67,14 @@ def write_readings(readings: Iterable[Reading], path: Path) -> int:
     scans = 0
     with path.open("wb") as file:
         for reading in readings:
-            write_record(file, _record(reading))
+            write_reading(file, reading)
             scans += isinstance(reading, Scan)
     return scans
+
+
+def write_reading(file: BinaryIO, reading: Reading) -> None:
+    """Append one reading to a file that `run_chain` and other programs can read."""
+    write_record(file, _record(reading))
 
 
 def run_chain(

@@ -16,9 +16,10 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.chain import write_reading
 from benchmarks.processes import MemorySample, run_child
 from hmt_service.core.geometry import FloatArray
-from hmt_service.core.types import StampedPose
+from hmt_service.core.types import Reading, StampedPose
 
 PINS = (
     "kiss-slam==0.0.2",
@@ -31,7 +32,9 @@ PINS = (
 )
 """What is installed; pip adds what these need."""
 _ROOT = Path(__file__).parents[1]
-_CREATE_S, _INSTALL_S, _IMPORT_S = 120.0, 1_800.0, 120.0
+_CREATE_S, _INSTALL_S, _IMPORT_S, _MAP_S = 120.0, 1_800.0, 120.0, 3_600.0
+ENVIRONMENT = "kiss-slam-environment"
+"""Name of the folder that benchmarks share."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,6 +120,37 @@ def run_kiss_slam(python: Path, readings: Path, folder: Path, *, timeout_s: floa
             loop_closures=int(arrays["loop_closures"]),
             samples=child.samples,
         )
+
+
+class KissSlamPeer:
+    """Keeps what a robot sends in a file, and lets KISS-SLAM map it when all of it is there."""
+
+    def __init__(self, python: Path, folder: Path) -> None:
+        """Begin without a scan.
+
+        Args:
+            python: What `make_environment` has returned.
+            folder: Where to keep the scans and leave the result.
+        """
+        self._python, self._folder = python, folder
+        self._readings = folder / "readings"
+        self._file = self._readings.open("wb")
+
+    def take(self, reading: Reading) -> None:
+        """Take what the robot sends."""
+        write_reading(self._file, reading)
+
+    def poses(self, stamps_s: FloatArray) -> FloatArray:
+        """Return where the robot was at the scans nearest to some stamps, shape (K, 4, 4).
+
+        Raises:
+            ChildFailed: If KISS-SLAM fails or takes longer than an hour.
+        """
+        self._file.close()
+        run = run_kiss_slam(self._python, self._readings, self._folder, timeout_s=_MAP_S)
+        known_s = np.array([pose.stamp_s for pose in run.trajectory])
+        nearest = np.abs(known_s[None] - stamps_s[:, None]).argmin(axis=1)
+        return np.array([run.trajectory[index].reference_from_body for index in nearest])
 
 
 def _python(folder: Path) -> Path:

@@ -25,6 +25,7 @@ from statistics import fmean
 from benchmarks.cells import Result
 from benchmarks.chain import ChainRun, read_readings, run_chain, write_readings
 from benchmarks.kiss_slam import (
+    ENVIRONMENT,
     KissSlamRun,
     find_environment,
     make_environment,
@@ -46,7 +47,6 @@ from hmt_service.sim.worlds.families import Family, draw
 Source = Callable[[Path], tuple[StampedPose, ...]]
 """Writes the readings of a drive to a file, and returns the true poses; none where unknown."""
 
-_ENVIRONMENT = "kiss-slam-environment"
 _TIMEOUT_S = 3_600.0
 _MB = 1e6
 _QUICK_SCANS = 60
@@ -71,7 +71,7 @@ _COSTS = {
 
 def measure(run: Run) -> Report:
     """Map every drive that is there with both."""
-    folder = run.out.parent / _ENVIRONMENT
+    folder = run.out.parent / ENVIRONMENT
     try:
         run.say("installing KISS-SLAM")
         python = find_environment(folder) if run.is_quick else make_environment(folder)

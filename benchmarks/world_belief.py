@@ -8,9 +8,9 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from pydantic import TypeAdapter
@@ -33,7 +33,15 @@ from hmt_service.core.engine import Engine
 from hmt_service.core.geometry import FloatArray, Pose, identity, inverse
 from hmt_service.core.odometry import Odometry
 from hmt_service.core.stored import StoredMap
-from hmt_service.core.types import Event, EventKind, GlobalMap, Keyframe, MapMethod, Tracking
+from hmt_service.core.types import (
+    Event,
+    EventKind,
+    GlobalMap,
+    Keyframe,
+    MapMethod,
+    Reading,
+    Tracking,
+)
 from hmt_service.sim.simulation import Instant
 
 
@@ -45,6 +53,8 @@ class Alone:
     """False loops of its topology at the end."""
     missed_loops: int
     """Its missed loops."""
+    placement: Placement
+    """How it places the keyframes that return."""
     engine_s: float
     """Processor time of the engine with all hypotheses, s."""
     engine_alone_s: float
@@ -78,6 +88,8 @@ class WorldBelief:
     """How it places the keyframes that return."""
     placement_odometry: Placement
     """How the motions from keyframe to keyframe alone place them."""
+    placement_peer: Placement | None
+    """How KISS-SLAM does, from the scans alone; None where it has not run."""
     decisions: tuple[Decision, ...]
     """One for each visit but the first."""
     decisions_always_new: tuple[Decision, ...]
@@ -144,18 +156,39 @@ class _Record:
             tuple(visit.first_keyframe for visit in stored.visits),
         )
 
-    def verdicts_on(self, stored: StoredMap) -> tuple[Verdict, ...]:
-        """Hold the most probable topology of a map against the truth."""
-        return judge_all(self.journey(stored), topologies_of(stored)[0])
+    def alone(self, stored: StoredMap, *, engine_s: float, engine_alone_s: float) -> Alone:
+        """Hold the map of an engine with one hypothesis against the truth."""
+        journey, topology = self.journey(stored), topologies_of(stored)[0]
+        verdicts = judge_all(journey, topology)
+        return Alone(
+            false_loops=verdicts.count(Verdict.FALSE_LOOP),
+            missed_loops=verdicts.count(Verdict.MISSED_LOOP),
+            placement=placement(journey, _poses(topology, journey)),
+            engine_s=engine_s,
+            engine_alone_s=engine_alone_s,
+        )
 
 
-def believe(instants: Iterable[Instant], config: Config, *, seed: int = 0) -> WorldBelief:
+class Peer(Protocol):
+    """Another program that maps the same scans."""
+
+    def take(self, reading: Reading) -> None:
+        """Take what the robot sends."""
+
+    def poses(self, stamps_s: FloatArray) -> FloatArray:
+        """Return where the robot was at some stamps, shape (K, 4, 4), when all has been sent."""
+
+
+def believe(
+    instants: Iterable[Instant], config: Config, *, seed: int = 0, peer: Peer | None = None
+) -> WorldBelief:
     """Map what a robot sends, as `hmt run` does, and hold every decision against the truth.
 
     Args:
         instants: What the robot sends and where it is, in the order of time.
         config: Settings of all stages.
         seed: Seed of all randomness of the engine.
+        peer: Another program that is to map the same; None: none.
     """
     particles = config.particles.model_copy(update={"budget": 1})
     alone = _TimedEngine(config.model_copy(update={"particles": particles}), seed)
@@ -164,6 +197,8 @@ def believe(instants: Iterable[Instant], config: Config, *, seed: int = 0) -> Wo
     engine = timed.engine
     for instant in instants:
         for reading in instant.readings:
+            if peer is not None:
+                peer.take(reading)
             tracking = odometry.process(reading)
             if tracking is None:
                 continue
@@ -182,14 +217,14 @@ def believe(instants: Iterable[Instant], config: Config, *, seed: int = 0) -> Wo
     stored = engine.stored()
     record.add_decisions(stored, len(stored.visits))
     built = engine.global_map(MapMethod.CONSISTENT, with_points=False)
-    verdicts = record.verdicts_on(alone.engine.stored())
-    beside = Alone(
-        false_loops=verdicts.count(Verdict.FALSE_LOOP),
-        missed_loops=verdicts.count(Verdict.MISSED_LOOP),
-        engine_s=timed.spent_s,
-        engine_alone_s=alone.spent_s,
+    beside = record.alone(
+        alone.engine.stored(), engine_s=timed.spent_s, engine_alone_s=alone.spent_s
     )
-    return _belief(stored, built, record, beside, is_planar=config.sensor.is_planar)
+    belief = _belief(stored, built, record, beside, is_planar=config.sensor.is_planar)
+    if peer is None:
+        return belief
+    stamps_s = np.array([keyframe.stamp_s for keyframe in stored.keyframes])
+    return replace(belief, placement_peer=placement(record.journey(stored), peer.poses(stamps_s)))
 
 
 class _TimedEngine:
@@ -242,6 +277,7 @@ def _belief(
         alone=alone,
         placement=placement(journey, _poses(topologies[0], journey)),
         placement_odometry=placement(journey, _chained(stored.keyframes)),
+        placement_peer=None,
         decisions=tuple(record.decisions),
         decisions_always_new=tuple(always_new(journey, visit) for visit in visits),
         odometry_errors=tuple(_odometry_errors(stored, journey, is_planar=is_planar)),

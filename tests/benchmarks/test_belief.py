@@ -50,9 +50,16 @@ def world(
         true_returns=returns,
         false_loops=false_loops,
         missed_loops=missed_loops,
-        alone=Alone(false_loops=0, missed_loops=1, engine_s=3.0, engine_alone_s=2.0),
+        alone=Alone(
+            false_loops=0,
+            missed_loops=1,
+            placement=Placement(10, 3),
+            engine_s=3.0,
+            engine_alone_s=2.0,
+        ),
         placement=Placement(10, 10 if is_right else 4),
         placement_odometry=Placement(10, 5),
+        placement_peer=None if is_planar else Placement(10, 10),
         decisions=tuple(decisions),
         decisions_always_new=tuple(
             Decision(
@@ -114,6 +121,10 @@ def test_the_numbers_of_a_report(tmp_path: Path) -> None:
     assert values["all/missed_loops_per_return"] == 0.25
     assert values["all/false_loops"] == 0
     assert values["all/placed_right"] == pytest.approx(0.7)
+    assert values["all/all_placed_right"] == 0.5
+    assert values["all/alone/placed_right"] == pytest.approx(0.3)
+    assert values["all/alone/all_placed_right"] == 0.0
+    assert "all/kiss_slam/placed_right" not in values
     assert values["all/decisions"] == 7
     assert values["all/brier"] == pytest.approx((0.04 + 0.81) / 7)
     assert values["all/contested/decisions"] == 4
@@ -144,7 +155,9 @@ def test_what_has_no_value_is_said(tmp_path: Path) -> None:
         "nees_3d/arcs: 1 maps, none of them right",
         "nees_3d/areas: 1 maps, none of them right",
     )
-    assert "nees_3d/odometry/mean" in {metric.key for metric in report.metrics}
+    values = {metric.key: metric.value for metric in report.metrics}
+    assert "nees_3d/odometry/mean" in values
+    assert values["garage/kiss_slam/all_placed_right"] == 1.0
 
 
 def test_figures_are_drawn(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""The environment of KISS-SLAM: when it counts as complete; installing is not tested here."""
+"""KISS-SLAM: when its environment is complete, what it is given; installing is not tested here."""
 
 from __future__ import annotations
 
@@ -8,11 +8,21 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from benchmarks import kiss_slam, kiss_slam_runner
-from benchmarks.kiss_slam import PINS, find_environment, make_environment
+from benchmarks.chain import read_readings
+from benchmarks.kiss_slam import (
+    PINS,
+    KissSlamPeer,
+    KissSlamRun,
+    find_environment,
+    make_environment,
+)
 from benchmarks.processes import ChildFailed, ChildRun
+from hmt_service.core.geometry import planar_pose
+from hmt_service.core.types import Scan, StampedPose
 
 
 class Installer:
@@ -79,3 +89,21 @@ def test_the_runner_loads_without_our_package() -> None:
         [sys.executable, "-c", code], cwd=root, capture_output=True, check=True, text=True
     )
     assert import_it.stdout.strip() == "benchmarks.kiss_slam_runner"
+
+
+def test_as_a_peer_it_maps_what_was_taken_and_is_asked_at_other_stamps(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def run(python: Path, readings: Path, folder: Path, *, timeout_s: float) -> KissSlamRun:
+        scans = list(read_readings(readings))
+        assert (python, folder) == (Path("python"), tmp_path)
+        assert timeout_s > 0.0
+        trajectory = tuple(StampedPose(s.stamp_s, planar_pose(s.stamp_s, 0, 0)) for s in scans)
+        return KissSlamRun(0.0, 0.0, 0.0, np.zeros(len(scans)), trajectory, 0, ())
+
+    monkeypatch.setattr(kiss_slam, "run_kiss_slam", run)
+    peer = KissSlamPeer(Path("python"), tmp_path)
+    for stamp_s in range(5):
+        peer.take(Scan(float(stamp_s), np.ones((2, 3)), np.zeros(3)))
+    poses = peer.poses(np.array([0.1, 2.6, 9.0]))
+    assert poses[:, 0, 3].tolist() == [0.0, 3.0, 4.0]

@@ -13,7 +13,8 @@ from benchmarks.calibration import consistency, score
 from benchmarks.scoring import Placement
 from benchmarks.world_belief import WorldBelief, as_result, believe, from_result
 from hmt_service.core.config import load_config
-from hmt_service.core.types import StampedPose
+from hmt_service.core.geometry import FloatArray
+from hmt_service.core.types import Reading, StampedPose
 from hmt_service.sim.simulation import Instant
 from tests.core.factories import RING, drifting, drive, ring_path
 
@@ -37,9 +38,24 @@ def instants(*, floors_m: float) -> Iterator[Instant]:
         )
 
 
+class AllKnowing:
+    """A peer that was told where the robot is, and how many readings came before it was asked."""
+
+    def __init__(self) -> None:
+        self.truth = {i.truth.stamp_s: i.truth for i in instants(floors_m=0.0)}
+        self.taken: list[Reading] = []
+
+    def take(self, reading: Reading) -> None:
+        self.taken.append(reading)
+
+    def poses(self, stamps_s: FloatArray) -> FloatArray:
+        assert len(self.taken) == 2 * len(PATH)
+        return np.array([self.truth[stamp_s].reference_from_body for stamp_s in stamps_s])
+
+
 @cache
 def closed_ring() -> WorldBelief:
-    return believe(instants(floors_m=0.0), CONFIG)
+    return believe(instants(floors_m=0.0), CONFIG, peer=AllKnowing())
 
 
 def test_a_ring_that_is_closed_is_right() -> None:
@@ -62,6 +78,7 @@ def test_the_map_places_what_returns_and_drifting_motions_alone_do_worse() -> No
     assert placed == Placement(placed.returning, placed.returning)
     assert chained.returning == placed.returning > 20
     assert chained.right <= placed.right
+    assert closed_ring().placement_peer == placed
 
 
 def test_poses_of_a_right_map_are_about_as_wrong_as_they_say() -> None:
@@ -84,6 +101,7 @@ def test_the_same_loops_are_false_if_the_truth_is_on_another_floor() -> None:
     assert score(belief.decisions).log_loss > 1.0
     assert score(belief.decisions_always_new).brier == 0.0
     assert belief.placement.returning == 0
+    assert belief.placement_peer is None
 
 
 def test_a_belief_survives_json() -> None:
