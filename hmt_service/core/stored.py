@@ -61,7 +61,7 @@ class StoredHypothesis:
     hypothesis: int
     """Identifier, unique in a run."""
     log_weight: float
-    """Logarithm of its posterior mass, up to a constant that all hypotheses share."""
+    """Logarithm of its posterior mass; the masses of all hypotheses sum to one."""
     assignments: tuple[StoredAssignment, ...]
     """The area of every visit, in the order of the visits: the topological path."""
     reference_from_visit: Mapping[int, Pose]

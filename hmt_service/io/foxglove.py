@@ -13,7 +13,7 @@ References:
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from types import MappingProxyType
@@ -167,10 +167,10 @@ def encode(
     """
     if isinstance(reading, OdometryReading):
         return Odometry(
-            timestamp=_timestamp(reading.stamp_s),
+            timestamp=timestamp_of(reading.stamp_s),
             frame_id=ODOMETRY_FRAME,
             body_frame_id="body",
-            pose=_pose_to_proto(reading.odom_from_body),
+            pose=pose_message(reading.odom_from_body),
         )
     body_from_sensor = identity()
     body_from_sensor[:3, 3] = reading.sensor_in_body
@@ -182,18 +182,40 @@ def encode(
         data[:points, axis] = reading.points_in_body[:, axis] - reading.sensor_in_body[axis]
     if reading.point_times is not None:
         data[:points, 3] = reading.point_times
+    return cloud_message(reading.stamp_s, "body", data, body_from_sensor, names)
+
+
+def cloud_message(
+    stamp_s: float,
+    frame: str,
+    rows: npt.NDArray[np.floating],
+    frame_from_points: Pose | None = None,
+    names: Sequence[str] = ("x", "y", "z"),
+) -> PointCloud:
+    """Return points as a message.
+
+    Args:
+        stamp_s: Stamp; rounded to ns.
+        frame: Name of the frame.
+        rows: One row per point, little-endian, shape (N, len(names)), m.
+        frame_from_points: Pose of the points' own origin in it; None for the identity.
+        names: What the columns are.
+
+    Raises:
+        InvalidInput: If the stamp is not finite.
+    """
     return PointCloud(
-        timestamp=_timestamp(reading.stamp_s),
-        frame_id="body",
-        pose=_pose_to_proto(body_from_sensor),
-        point_stride=data.itemsize * len(names),
+        timestamp=timestamp_of(stamp_s),
+        frame_id=frame,
+        pose=pose_message(identity() if frame_from_points is None else frame_from_points),
+        point_stride=rows.itemsize * len(names),
         fields=[
             PackedElementField(
-                name=name, offset=data.itemsize * column, type=_FLOATS[data.itemsize]
+                name=name, offset=rows.itemsize * column, type=_FLOATS[rows.itemsize]
             )
             for column, name in enumerate(names)
         ],
-        data=data.tobytes(),
+        data=rows.tobytes(),
     )
 
 
@@ -340,7 +362,8 @@ def _pose(message: PoseMessage, *, farthest_m: float) -> Pose:
     return pose
 
 
-def _pose_to_proto(pose: Pose) -> PoseMessage:
+def pose_message(pose: Pose) -> PoseMessage:
+    """Return a pose as a message."""
     qx, qy, qz, qw = quaternion_of(pose).tolist()
     x, y, z = pose[:3, 3].tolist()
     return PoseMessage(
@@ -355,7 +378,12 @@ def _stamp(message: LaserScan | PointCloud | Odometry | PoseInFrame) -> float:
     return (stamp.seconds * _NANOSECONDS + stamp.nanos) / _NANOSECONDS
 
 
-def _timestamp(stamp_s: float) -> Timestamp:
+def timestamp_of(stamp_s: float) -> Timestamp:
+    """Return a stamp as a message, rounded to ns.
+
+    Raises:
+        InvalidInput: If it is not finite.
+    """
     if not math.isfinite(stamp_s):
         raise InvalidInput(f"stamp {stamp_s} s is not finite")
     whole = math.floor(stamp_s)

@@ -13,7 +13,7 @@ from __future__ import annotations
 import sqlite3
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
-from contextlib import closing
+from contextlib import closing, contextmanager
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -31,7 +31,7 @@ from hmt_service.core.stored import (
     StoredScan,
     StoredVisit,
 )
-from hmt_service.core.types import Keyframe, Points, TrackingFailure
+from hmt_service.core.types import NO_POINTS, Keyframe, Points, TrackingFailure
 from hmt_service.errors import InvalidInput, NotFound, Unavailable
 
 SCHEMA_VERSION = 2
@@ -104,12 +104,28 @@ def write_map(path: Path, stored: StoredMap) -> None:
         partial.unlink(missing_ok=True)
 
 
-def read_map(path: Path) -> StoredMap:
+def read_map(path: Path, *, with_points: bool = True) -> StoredMap:
     """Read a map file.
+
+    Args:
+        path: Map file.
+        with_points: Whether keyframes come with what they saw, which is most of the file.
 
     Raises:
         NotFound: If there is no such file.
-        InvalidInput: If it is no map file, is damaged or was written by a newer version.
+        InvalidInput: If it is no map file, is damaged or was written by another version.
+    """
+    with opened(path) as database:
+        return _read(database, with_points=with_points)
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[sqlite3.Connection]:
+    """Open a map file for reading; what cannot be read meanwhile is told of the file.
+
+    Raises:
+        NotFound: If there is no such file.
+        InvalidInput: If it is no map file, is damaged or was written by another version.
     """
     if not path.is_file():
         raise NotFound(f"map file {path} does not exist")
@@ -118,7 +134,7 @@ def read_map(path: Path) -> StoredMap:
     try:
         with closing(sqlite3.connect(uri, uri=True)) as database:
             _check_version(path, database)
-            return _read(database)
+            yield database
     except (sqlite3.DatabaseError, zstandard.ZstdError, KeyError, ValueError) as error:
         size = path.stat().st_size
         raise InvalidInput(f"{path} ({size} bytes) is no map file or damaged: {error}") from error
@@ -202,7 +218,7 @@ def _write(database: sqlite3.Connection, stored: StoredMap) -> None:
         )
 
 
-def _read(database: sqlite3.Connection) -> StoredMap:
+def _read(database: sqlite3.Connection, *, with_points: bool) -> StoredMap:
     meta = dict(_rows(database, "meta"))
     resolution_m = float(meta["point_resolution_m"])
     decompressor = zstandard.ZstdDecompressor()
@@ -210,7 +226,7 @@ def _read(database: sqlite3.Connection) -> StoredMap:
         Keyframe(
             index,
             stamp_s,
-            _points(points, resolution_m, decompressor),
+            _points(points, resolution_m, decompressor) if with_points else NO_POINTS,
             _numbers(sensor),
             _gaussian(motion),
             _numbers(own_error).reshape(6, 6),
