@@ -22,7 +22,7 @@ from pydantic import ValidationError
 from hmt_service.core.config import Config
 from hmt_service.core.geometry import FloatArray
 from hmt_service.core.types import TrackingFailure
-from hmt_service.io.map_file import opened
+from hmt_service.io.map_file import DIGEST, TABLES, content_digest, opened
 
 # What is stored in single precision is no rotation, and no covariance, to the last digit.
 _ROTATION_TOLERANCE = 1e-5
@@ -31,6 +31,7 @@ _MASS_TOLERANCE = 1e-6
 _POINT_BYTES = 12
 _SHOWN = 5
 _Row = Mapping[str, Any]
+_TYPES: Mapping[str, type] = {"TEXT": str, "INTEGER": int, "REAL": float, "BLOB": bytes}
 
 
 def check_map(path: Path) -> tuple[str, ...]:
@@ -46,12 +47,16 @@ def check_map(path: Path) -> tuple[str, ...]:
 
 def _violations(database: sqlite3.Connection) -> Iterator[str]:
     yield from _database(database)
+    tables: dict[str, list[_Row]] = {}
     try:
-        tables = {name: _rows(database, name) for name in ("meta", *_BLOBS, *_PLAIN)}
+        for table in TABLES:
+            tables[table] = []
+            yield from _read(database, table, tables[table])
+        digest = content_digest(database)
     except (sqlite3.DatabaseError, UnicodeDecodeError) as error:
         yield f"database: {error}; the rest was not checked"
         return
-    yield from _meta({row["key"]: row["value"] for row in tables["meta"]})
+    yield from _meta({row["key"]: row["value"] for row in tables["meta"]}, digest)
     yield from _content(tables)
     keyframes = [row["keyframe"] for row in tables["keyframes"]]
     visits = [row["visit"] for row in tables["visits"]]
@@ -69,17 +74,31 @@ def _database(database: sqlite3.Connection) -> Iterator[str]:
         for (text,) in database.execute("PRAGMA integrity_check"):
             if text != "ok":
                 yield f"database: {' '.join(text.split())}"
-    except sqlite3.DatabaseError as error:
+    except (sqlite3.DatabaseError, UnicodeDecodeError) as error:
         yield f"database: {error}"
 
 
-def _rows(database: sqlite3.Connection, table: str) -> list[_Row]:
-    cursor = database.execute(f"SELECT * FROM {table} ORDER BY rowid")
-    names = [column[0] for column in cursor.description]
-    return [dict(zip(names, row, strict=True)) for row in cursor]
+def _read(database: sqlite3.Connection, table: str, rows: list[_Row]) -> Iterator[str]:
+    """Append the rows of a table, and yield why some are left out.
+
+    Pages are not read as they were written when they are damaged: any value may be of any type.
+    """
+    columns = list(database.execute(f"PRAGMA table_info({table})"))
+    for position, row in enumerate(database.execute(f"SELECT * FROM {table} ORDER BY rowid")):
+        wrong = [
+            f"{name} is {type(value).__name__}, not {declared}"
+            for (_, name, declared, is_needed, *_), value in zip(columns, row, strict=True)
+            if not isinstance(value, _TYPES[declared]) and (is_needed or value is not None)
+        ]
+        if wrong:
+            yield f"{table}, row {position}: {', '.join(wrong)}"
+        else:
+            rows.append({column[1]: value for column, value in zip(columns, row, strict=True)})
 
 
-def _meta(meta: Mapping[str, str]) -> Iterator[str]:
+def _meta(meta: Mapping[str, str], digest: str) -> Iterator[str]:
+    if meta.get(DIGEST, digest) != digest:
+        yield f"meta: {DIGEST} is {meta[DIGEST][:12]}…, that of the content is {digest[:12]}…"
     for key, read in _META.items():
         if key not in meta:
             yield f"meta: {key} is missing"
@@ -105,6 +124,7 @@ _META: Mapping[str, Callable[[str], object]] = {
     "seed": int,
     "config": Config.model_validate_json,
     "point_resolution_m": _resolution_m,
+    DIGEST: str,
 }
 
 
@@ -194,7 +214,7 @@ def _gaussian(blob: bytes | None) -> Iterator[str]:
 def _points(blob: bytes) -> Iterator[str]:
     try:
         size = len(zstandard.ZstdDecompressor().decompress(blob))
-    except zstandard.ZstdError as error:
+    except (zstandard.ZstdError, MemoryError) as error:
         yield f"of {len(blob)} bytes cannot be decompressed: {error}"
         return
     if size % _POINT_BYTES:
@@ -213,8 +233,6 @@ _BLOBS: Mapping[str, Mapping[str, Callable[[bytes], Iterator[str]]]] = {
     "anchors": {"reference_from_visit": _pose},
     "factors": {"a_from_b": _gaussian},
 }
-_PLAIN = ("visits", "hypotheses")
-"""Tables without blobs."""
 
 
 # ------------------------------------------------------------------ what fits together

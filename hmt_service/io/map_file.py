@@ -3,6 +3,7 @@
 Poses are blobs of little-endian float64 and come back bit for bit: the upper three rows of the
 matrix (12 numbers), then the 6x6 covariance where there is one (36 numbers), row by row. Points are
 rounded to a grid whose resolution stands in `meta`, and compressed. Rows keep the tuples' order.
+`meta` also holds a digest of everything else, which `map_check` compares.
 
 References:
     own; https://www.sqlite.org/fileformat2.html.
@@ -10,7 +11,9 @@ References:
 
 from __future__ import annotations
 
+import hashlib
 import sqlite3
+import struct
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from contextlib import closing, contextmanager
@@ -39,6 +42,22 @@ SCHEMA_VERSION = 2
 POINT_RESOLUTION_M = 0.005
 """Edge of the grid that points are rounded to."""
 
+TABLES = (
+    "meta",
+    "keyframes",
+    "scans",
+    "visits",
+    "hypotheses",
+    "assignments",
+    "anchors",
+    "factors",
+)
+"""All tables."""
+DIGEST = "content_sha256"
+"""Key in `meta` of what `content_digest` says of the rest."""
+
+# Magic string, `PRAGMA user_version` and `PRAGMA application_id`.
+_HEAD = struct.Struct(">60sI4xI")
 _APPLICATION_ID = int.from_bytes(b"hmtm")
 _COMPRESSION_LEVEL = 6
 _SCHEMA = """
@@ -92,6 +111,7 @@ def write_map(path: Path, stored: StoredMap) -> None:
             database.execute("PRAGMA journal_mode = OFF")
             database.executescript(f"BEGIN; {_SCHEMA}")
             _write(database, stored)
+            _insert(database, "meta", [(DIGEST, content_digest(database))])
             database.execute(f"PRAGMA application_id = {_APPLICATION_ID}")
             database.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
             database.execute("COMMIT")
@@ -129,20 +149,37 @@ def opened(path: Path) -> Iterator[sqlite3.Connection]:
     """
     if not path.is_file():
         raise NotFound(f"map file {path} does not exist")
+    _check_version(path)
     # Map files are replaced, never changed: "immutable" reads them from read-only media, too.
     uri = f"{path.resolve().as_uri()}?mode=ro&immutable=1"
     try:
         with closing(sqlite3.connect(uri, uri=True)) as database:
-            _check_version(path, database)
             yield database
     except (sqlite3.DatabaseError, zstandard.ZstdError, KeyError, ValueError) as error:
         size = path.stat().st_size
         raise InvalidInput(f"{path} ({size} bytes) is no map file or damaged: {error}") from error
 
 
-def _check_version(path: Path, database: sqlite3.Connection) -> None:
-    (application,) = database.execute("PRAGMA application_id").fetchone()
-    (version,) = database.execute("PRAGMA user_version").fetchone()
+def content_digest(database: sqlite3.Connection) -> str:
+    """Return the SHA-256 of all rows of all tables but the digest itself, in hexadecimal."""
+    digest = hashlib.sha256()
+    for table in TABLES:
+        for row in _rows(database, table):
+            if row[0] != DIGEST:
+                # Lengths keep the borders between values: "ab", "c" is not "a", "bc".
+                values = [v if isinstance(v, bytes) else repr(v).encode() for v in row]
+                digest.update(repr([len(value) for value in values]).encode())
+                digest.update(b"".join(values))
+    return digest.hexdigest()
+
+
+def _check_version(path: Path) -> None:
+    """Look at the head of the file only: it is there when the rest is damaged."""
+    with path.open("rb") as file:
+        head = file.read(_HEAD.size)
+    if len(head) < _HEAD.size or not head.startswith(b"SQLite format 3\0"):
+        raise InvalidInput(f"{path} ({path.stat().st_size} bytes) is no map file or damaged")
+    _, version, application = _HEAD.unpack(head)
     if application != _APPLICATION_ID:
         raise InvalidInput(
             f"{path} is an SQLite file of another application "
