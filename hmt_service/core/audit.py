@@ -185,4 +185,6 @@ def lost(keyframe: Keyframe, failure: TrackingFailure, registration: Registratio
         numbers["inlier_share"] = registration.inlier_share
         numbers["correction_m"] = registration.correction_m
     message = f"keyframe {keyframe.index} was not registered ({failure})"
+    if failure is TrackingFailure.NEW_SESSION:
+        message = f"a new session begins with keyframe {keyframe.index}: the robot may be anywhere"
     return Event(EventKind.LOST, keyframe.stamp_s, message, numbers)

@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 import networkx as nx
 import numpy as np
 
+from hmt_service.core.awakening import is_anywhere
 from hmt_service.core.geometry import (
     FloatArray,
     GaussianPose,
@@ -49,8 +50,12 @@ def arcs_of(hypothesis: Hypothesis, motions: Sequence[Factor]) -> tuple[Arc, ...
         end = hypothesis.topology.assignments[motion.visit_b]
         if start.area == end.area:
             continue
-        a_from_b = _aligned(start.area_from_visit) @ motion.a_from_b
-        a_from_b = a_from_b @ _aligned(end.area_from_visit).inverse()
+        if is_anywhere(motion.a_from_b):
+            # What ties a session to those before is no motion, but all that has been recognised.
+            a_from_b = hypothesis.graph.relative(start.area, end.area)
+        else:
+            a_from_b = _aligned(start.area_from_visit) @ motion.a_from_b
+            a_from_b = a_from_b @ _aligned(end.area_from_visit).inverse()
         pair = (start.area, end.area)
         if pair[0] > pair[1]:
             pair, a_from_b = (pair[1], pair[0]), a_from_b.inverse()

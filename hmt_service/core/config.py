@@ -159,6 +159,8 @@ class TransitionConfig(Section):
     """Share of a submap's reach by which an area extends beyond where the robot has been."""
     max_candidates: int = Field(default=8, ge=1)
     """Most known areas that one entry is compared with: the nearest."""
+    outside_share: float = Field(default=0.1, gt=0.0, lt=1.0)
+    """Prior probability that a robot that wakes up is at a place that its map does not know."""
     prior_samples: int = Field(default=256, ge=16)
     """Samples for the prior mass outside all known areas."""
 

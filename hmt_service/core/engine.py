@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -20,6 +21,7 @@ from hmt_service.core import audit
 from hmt_service.core.alignment import Aligner
 from hmt_service.core.area_abstraction import overlap_of, partition
 from hmt_service.core.audit import Audit
+from hmt_service.core.awakening import awakened
 from hmt_service.core.composition import arcs_of, compose_shortest_paths, residual_m
 from hmt_service.core.config import Config
 from hmt_service.core.geometry import FloatArray, GaussianPose, Pose, inverse, log
@@ -36,13 +38,12 @@ from hmt_service.core.observation import ObservationModel
 from hmt_service.core.plausibility import Plausibility
 from hmt_service.core.refinement import Refinement
 from hmt_service.core.smoothing import Smoother
-from hmt_service.core.stored import (
-    ScanLog,
-    StoredAssignment,
-    StoredFactor,
-    StoredHypothesis,
-    StoredMap,
-    StoredVisit,
+from hmt_service.core.stored import ScanLog, StoredMap
+from hmt_service.core.storing import (
+    restored_hypothesis,
+    restored_visits,
+    stored_hypothesis,
+    stored_visits,
 )
 from hmt_service.core.submap import Visit, as_points, visit_of
 from hmt_service.core.transition import Successor, Transition
@@ -102,6 +103,40 @@ class Engine:
         self._revision = 0
         self._finished_revision = 0
         self._smoothed: tuple[int, FloatArray] | None = None
+        self._first_of_session = 0
+
+    @classmethod
+    def restored(cls, stored: StoredMap, *, seed: int = 0) -> Engine:
+        """Return an engine that goes on with a stored map, in a new session.
+
+        The next tracking is the first of an odometry that knows nothing of the map: the robot may
+        be anywhere in it, or outside.
+
+        Args:
+            stored: The map, with at least one keyframe.
+            seed: Seed of all randomness from now on.
+
+        Raises:
+            InvalidInput: If the settings in the map are not of this version.
+        """
+        config = stored.config
+        engine = cls(config, seed=seed)
+        for keyframe in stored.keyframes:
+            engine._observation.learn(keyframe)
+        for scan in stored.scans:
+            engine._scans.append(scan.stamp_s, scan.keyframe_index, scan.keyframe_from_body)
+        visits = engine._visits = restored_visits(stored, config)
+        engine._motions = [
+            Factor(v, v + 1, visits[v].motion_to(visits[v + 1])) for v in range(len(visits) - 1)
+        ]
+        is_planar = config.sensor.is_planar
+        engine._particles.replace(
+            [restored_hypothesis(h, is_planar=is_planar) for h in stored.hypotheses]
+        )
+        engine._next_hypothesis = 1 + max(h.hypothesis for h in stored.hypotheses)
+        engine._revision = engine._finished_revision = stored.revision
+        engine._first_of_session = len(stored.keyframes)
+        return engine
 
     # ------------------------------------------------------------------ from scans to hypotheses
 
@@ -114,6 +149,7 @@ class Engine:
         Returns:
             What was decided because of it.
         """
+        tracking = self._of_session(tracking)
         pose = tracking.keyframe_from_body.mean
         self._scans.append(tracking.stamp_s, tracking.keyframe_index, pose)
         self._tracked.update(_said_of(tracking))
@@ -133,8 +169,19 @@ class Engine:
         """
         known = self._open.last_keyframe + 1 if self._visits else 0
         # Before the first keyframe scans are relative to none.
-        is_next = tracking.keyframe is not None or known == 0
-        return tracking.keyframe_index >= known + is_next
+        is_next = tracking.keyframe is not None or known == self._first_of_session
+        return self._first_of_session + tracking.keyframe_index >= known + is_next
+
+    def _of_session(self, tracking: Tracking) -> Tracking:
+        """Number the keyframes of a new session after those of the map that it goes on with."""
+        first, keyframe = self._first_of_session, tracking.keyframe
+        if first == 0:
+            return tracking
+        if keyframe is not None:
+            keyframe = replace(keyframe, index=first + keyframe.index)
+            if keyframe.index == first:
+                keyframe = awakened(keyframe, is_planar=self._config.sensor.is_planar)
+        return replace(tracking, keyframe_index=first + tracking.keyframe_index, keyframe=keyframe)
 
     def _map(self, keyframe: Keyframe, registration: Registration | None) -> tuple[Event, ...]:
         """Add a keyframe to every hypothesis."""
@@ -515,17 +562,13 @@ class Engine:
 
     def stored(self) -> StoredMap:
         """Return everything that a map file needs to hold."""
-        visits = tuple(self._visits.values())
         return StoredMap(
             revision=self._revision,
             seed=self._seed,
             config_json=self._config.model_dump_json(),
-            keyframes=tuple(k for visit in visits for k in visit.keyframes),
-            visits=tuple(
-                StoredVisit(visit.visit, visit.first_keyframe, visit.last_keyframe)
-                for visit in visits
-            ),
-            hypotheses=tuple(_stored(h) for h in self._particles.hypotheses),
+            keyframes=tuple(k for visit in self._visits.values() for k in visit.keyframes),
+            visits=stored_visits(self._visits),
+            hypotheses=tuple(stored_hypothesis(h) for h in self._particles.hypotheses),
             scans=tuple(self._scans),
         )
 
@@ -605,19 +648,4 @@ def _difference(area: int, consistent: GaussianPose, shortest: GaussianPose) -> 
         rotation_rad=float(np.linalg.norm(apart[:3])),
         sigma_consistent_m=consistent.sigma_m,
         sigma_shortest_path_m=shortest.sigma_m,
-    )
-
-
-def _stored(hypothesis: Hypothesis) -> StoredHypothesis:
-    return StoredHypothesis(
-        hypothesis=hypothesis.hypothesis,
-        log_weight=hypothesis.log_weight,
-        assignments=tuple(
-            StoredAssignment(a.visit, a.area, a.area_from_visit)
-            for a in hypothesis.topology.assignments
-        ),
-        reference_from_visit={v: hypothesis.graph.pose(v) for v in hypothesis.graph.visits},
-        factors=tuple(
-            StoredFactor(f.visit_a, f.visit_b, f.a_from_b) for f in hypothesis.graph.factors
-        ),
     )

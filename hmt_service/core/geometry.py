@@ -26,6 +26,8 @@ PLANAR_AXES = np.array([2, 3, 4])
 """Tangent components that a planar robot can move along: yaw, x, y."""
 _OFF_PLANE_AXES = np.array([0, 1, 5])
 _SMALL_ANGLE_RAD = 1e-7
+ANY_HEADING_RAD = np.pi / np.sqrt(3.0)
+"""Standard deviation of a heading that may be anything."""
 
 
 def identity() -> Pose:

@@ -18,9 +18,11 @@ from copy import copy
 from dataclasses import dataclass
 
 import gtsam
+import networkx as nx
 import numpy as np
 import numpy.typing as npt
 
+from hmt_service.core.awakening import is_anywhere
 from hmt_service.core.geometry import (
     FloatArray,
     GaussianPose,
@@ -51,6 +53,11 @@ class Factor:
     """The other end."""
     a_from_b: GaussianPose
     """Relative pose."""
+
+    @property
+    def reversed(self) -> Factor:
+        """The same arc, told from its other end."""
+        return Factor(self.visit_b, self.visit_a, self.a_from_b.inverse())
 
 
 @dataclass(frozen=True, slots=True)
@@ -209,12 +216,29 @@ class _Solver:
             self._factors += 1
             graph.add(self._space.factor(factor))
             self._place(factor, values)
+        self._solve(graph, values, replaced)
+
+    def _solve(
+        self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, replaced: list[int]
+    ) -> None:
         result = self._isam.update(graph, values, replaced)
         for _ in range(_MAX_UPDATES):
             if not result.getVariablesRelinearized():
                 break
             result = self._isam.update()
         self._forget()
+
+    def begin(self, poses: Mapping[int, Pose], factors: Iterable[Factor]) -> None:
+        """Solve for the first time, with arcs between visits whose poses are known about."""
+        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        graph.add(self._space.reference(min(poses)))
+        for visit, pose in poses.items():
+            values.insert(visit, self._space.value(pose))
+        for index, factor in enumerate(factors, start=1):
+            graph.add(self._space.factor(factor))
+            self._index_of[_key(factor.visit_a, factor.visit_b)] = index
+        self._factors = graph.size()
+        self._solve(graph, values, [])
 
     def _place(self, factor: Factor, values: gtsam.Values) -> None:
         """Put the end of an arc that is new to where the arc says."""
@@ -269,7 +293,78 @@ class PoseGraph:
         self._pending: dict[tuple[int, int], Factor] = {}
         self._removed: tuple[tuple[int, int], ...] = ()
         self._held: dict[int, tuple[int, Pose]] = {}
+        self._has_parts = False
         self._use(_Solver(self._space))
+
+    @classmethod
+    def restored(
+        cls,
+        poses: Mapping[int, Pose],
+        factors: Iterable[Factor],
+        anchors: Mapping[int, int],
+        *,
+        is_planar: bool,
+    ) -> PoseGraph:
+        """Return the graph that another one was.
+
+        Args:
+            poses: Of all visits by their numbers, near the solution; the first at the origin.
+            factors: All arcs.
+            anchors: Of each visit that was eliminated the visit that it keeps its place beside.
+            is_planar: Whether solved poses are kept planar exactly.
+        """
+        graph = cls(is_planar=is_planar)
+        graph._visits = dict.fromkeys(sorted(poses))
+        graph._factors = {_key(f.visit_a, f.visit_b): f for f in factors}
+        graph._has_parts = any(is_anywhere(f.a_from_b) for f in graph._factors.values())
+        graph._held = {
+            visit: (anchor, inverse(poses[anchor]) @ poses[visit])
+            for visit, anchor in anchors.items()
+        }
+        free = {visit: pose for visit, pose in poses.items() if visit not in anchors}
+        graph._solver.begin(free, graph._factors.values())
+        return graph
+
+    def part_of(self, visit: int) -> frozenset[int]:
+        """Return the visits whose pose relative to one is known, that one included.
+
+        A session that began anywhere is a part of its own until an alignment ties it.
+        """
+        if self.is_whole:
+            return frozenset(self._visits)
+        known = nx.Graph(
+            key for key, factor in self._factors.items() if not is_anywhere(factor.a_from_b)
+        )
+        known.add_nodes_from(self._visits)
+        known.add_edges_from((held, anchor) for held, (anchor, _) in self._held.items())
+        return frozenset(nx.node_connected_component(known, visit))
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether there never was an arc that says nothing: then all is one part."""
+        return not self._has_parts
+
+    def joined(self, factor: Factor) -> PoseGraph:
+        """Return a graph with one more arc, also between two parts that had no place before.
+
+        The part that is without the first visit goes where the arc says: a solver would not find
+        there, whose steps are small.
+        """
+        part = self.part_of(factor.visit_b)
+        graph = self.copy()
+        if factor.visit_a not in part:
+            if next(iter(self._visits)) in part:
+                return self.joined(
+                    Factor(factor.visit_b, factor.visit_a, factor.a_from_b.inverse())
+                )
+            there = self.pose(factor.visit_a) @ factor.a_from_b.mean
+            moved = there @ inverse(self.pose(factor.visit_b))
+            poses = {v: moved @ self.pose(v) if v in part else self.pose(v) for v in self._visits}
+            anchors = {visit: anchor for visit, (anchor, _) in self._held.items()}
+            is_planar = self._space is _PLANAR
+            graph = PoseGraph.restored(poses, self.factors, anchors, is_planar=is_planar)
+        graph.fuse_factor(factor)
+        return graph
 
     def copy(self) -> PoseGraph:
         """Return an independent graph that shares factors and solution until one changes."""
@@ -304,6 +399,7 @@ class PoseGraph:
         """
         key = _key(factor.visit_a, factor.visit_b)
         self._factors[key] = self._pending[key] = factor
+        self._has_parts |= is_anywhere(factor.a_from_b)
         self._visits.setdefault(factor.visit_b)
 
     def eliminate(self, visit: int, anchor: int) -> None:

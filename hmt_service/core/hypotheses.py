@@ -19,6 +19,7 @@ from itertools import pairwise
 import numpy as np
 
 from hmt_service.core.alignment import SEPARATION_M, SEPARATION_RAD
+from hmt_service.core.awakening import is_anywhere
 from hmt_service.core.geometry import (
     FloatArray,
     GaussianPose,
@@ -139,10 +140,16 @@ class Hypothesis:
             hypothesis: Identifier of the successor.
             log_weight: Its log weight, not normalised.
         """
-        graph = self.graph.copy()
-        graph.add_factor(arc)
-        if assignment.area_from_visit is not None:
-            graph.fuse_factor(Factor(assignment.area, assignment.visit, assignment.area_from_visit))
+        graph, place = self.graph.copy(), assignment.area_from_visit
+        if place is None:
+            graph.add_factor(arc)
+        else:
+            # The first arc places the visit: its motion may say nothing.
+            first, second = Factor(assignment.area, assignment.visit, place), arc
+            if not is_anywhere(arc.a_from_b):
+                first, second = second, first
+            graph.add_factor(first)
+            graph.fuse_factor(second)
         topology = self.topology.with_visit(assignment)
         return Hypothesis(hypothesis, log_weight, topology, graph, self.unlikely_for)
 
@@ -164,8 +171,8 @@ class Hypothesis:
             hypothesis: Identifier of the successor.
             log_weight: Its log weight, not normalised.
         """
-        visit, topology, graph = self.current.visit, self.topology, self.graph.copy()
-        graph.fuse_factor(Factor(area, visit, area_from_visit))
+        visit, topology = self.current.visit, self.topology
+        graph = self.graph.joined(Factor(area, visit, area_from_visit))
         if is_same_area:
             topology = topology.with_visit(Assignment(visit, area, area_from_visit))
         return Hypothesis(hypothesis, log_weight, topology, graph, self.unlikely_for)

@@ -13,6 +13,7 @@ import numpy as np
 
 from hmt_service.core.config import Config
 from hmt_service.core.geometry import (
+    ANY_HEADING_RAD,
     FloatArray,
     GaussianPose,
     Pose,
@@ -40,8 +41,7 @@ from hmt_service.core.types import (
 from hmt_service.core.wheels import WheelCalibration, sigmas_of
 from hmt_service.errors import InvalidInput
 
-# Of a heading that may be anything, and of a position that nothing but speed bounds.
-_LOST_RAD = np.pi / np.sqrt(3.0)
+# Of a position that nothing but speed bounds.
 _LOST_M = 100.0
 # Two stamps of one moment may differ by this much.
 _STAMP_SLACK_S = 1.0
@@ -190,13 +190,14 @@ class Odometry:
             motion = exp(elapsed_s / self._last_elapsed_s * log(self._last_motion))
             # Speed has changed since the interval before, for as long as this one takes.
             sigma_rad = min(
-                noise.sigma_floor_rad + noise.angular_acceleration_rad_s2 * elapsed_s**2, _LOST_RAD
+                noise.sigma_floor_rad + noise.angular_acceleration_rad_s2 * elapsed_s**2,
+                ANY_HEADING_RAD,
             )
             sigma_m = noise.sigma_floor_m + noise.acceleration_m_s2 * elapsed_s**2
         else:
             motion = identity()
             # Two scans of one moment are no reason to know where the second was taken.
-            sigma_rad = _LOST_RAD
+            sigma_rad = ANY_HEADING_RAD
             sigma_m = max(noise.sigma_floor_m, noise.max_speed_m_s * elapsed_s)
         if self._sensor.is_planar:
             motion = project_planar(motion)
@@ -298,7 +299,7 @@ class Odometry:
     def _lost(self, mean: Pose, elapsed_s: float) -> GaussianPose:
         """Return a pose that is bounded by the robot's speed only."""
         sigma_m = min(self._motion.max_speed_m_s * elapsed_s, _LOST_M)
-        covariance = isotropic_covariance(sigma_rad=_LOST_RAD, sigma_m=sigma_m)
+        covariance = isotropic_covariance(sigma_rad=ANY_HEADING_RAD, sigma_m=sigma_m)
         return self._confined(GaussianPose(mean, covariance))
 
     def _learn(self, keyframe_from_body: Pose, covariance: FloatArray) -> None:

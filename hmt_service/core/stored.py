@@ -13,9 +13,12 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from pydantic import ValidationError
 
+from hmt_service.core.config import Config
 from hmt_service.core.geometry import GaussianPose, Pose, exp, log
 from hmt_service.core.types import Keyframe
+from hmt_service.errors import InvalidInput
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,4 +123,16 @@ class StoredMap:
     hypotheses: tuple[StoredHypothesis, ...]
     """All hypotheses that are alive, in the engine's order."""
     scans: tuple[StoredScan, ...]
-    """In the order of their stamps."""
+    """In the order that they came."""
+
+    @property
+    def config(self) -> Config:
+        """The settings.
+
+        Raises:
+            InvalidInput: If they are not those of this version.
+        """
+        try:
+            return Config.model_validate_json(self.config_json)
+        except ValidationError as error:
+            raise InvalidInput(f"the map's settings are not of this version: {error}") from error

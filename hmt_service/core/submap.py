@@ -217,8 +217,11 @@ class Visit:
             self.config,
         )
         later = visit_of(self.visit + 1, self.keyframes[first_of_new:], self.config)
-        last, new = earlier.keyframes[-1], later.keyframes[0]
-        return earlier, later, _chained(earlier.visit_from_keyframe[-1], last, new)
+        return earlier, later, earlier.motion_to(later)
+
+    def motion_to(self, following: Visit) -> GaussianPose:
+        """Return the motion from this visit's frame to that of the visit just after it."""
+        return _chained(self.visit_from_keyframe[-1], self.keyframes[-1], following.keyframes[0])
 
 
 @lru_cache(maxsize=_LOCAL_MAPS)

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hmt_service.core.alignment import Aligner, Mode
+from hmt_service.core.awakening import anywhere_in, is_anywhere
 from hmt_service.core.config import Config
 from hmt_service.core.geometry import (
     PLANAR_AXES,
@@ -52,7 +53,8 @@ class Successor:
 class _Candidate:
     area: int
     area_from_visit: GaussianPose
-    distance_m: float
+    mass: float = 1.0
+    """Prior probability of the area where it is not in the pose: nothing else says where it is."""
 
 
 class Transition:
@@ -99,8 +101,11 @@ class Transition:
         """
         candidates = self._candidates(hypothesis, visit, arc.visit_a, arc.a_from_b, visits)
         outside = self._mass_outside(candidates, visit, visits)
+        anywhere = self._anywhere(hypothesis, visit, arc.visit_a, arc.a_from_b, visits, outside)
+        if anywhere:
+            outside *= self._config.outside_share
         new = Successor(None, None, 0.0, float(np.log(outside)))
-        return (new, *self._matches(visit, candidates, visits))
+        return (new, *self._matches(visit, [*candidates, *anywhere], visits))
 
     def recognitions(
         self, hypothesis: Hypothesis, visit: Visit, visits: Visits
@@ -126,7 +131,11 @@ class Transition:
             visits,
             is_asked=lambda prior: not is_certain(prior, self._refinement),
         )
-        return self._matches(visit, candidates, visits)
+        # As a new area it was outside all that is known: of that much less was expected.
+        anywhere = self._anywhere(
+            hypothesis, visit, visit.visit, here, visits, 1.0 / self._config.outside_share
+        )
+        return self._matches(visit, [*candidates, *anywhere], visits)
 
     def _matches(
         self,
@@ -140,7 +149,8 @@ class Transition:
                 candidate.area,
                 mode.target_from_visit,
                 mode.overlap,
-                self._log_factor(visit, visits[candidate.area], candidate.area_from_visit, mode),
+                self._log_factor(visit, visits[candidate.area], candidate.area_from_visit, mode)
+                + float(np.log(candidate.mass)),
             )
             for candidate in candidates
             for mode in self._aligner.modes(
@@ -164,7 +174,8 @@ class Transition:
         # and who does not know how he went may not have left at all.
         is_known = is_certain(known_from_visit, self._refinement)
         left = known if is_known and hypothesis.current.area == known else None
-        areas = np.array([area for area in hypothesis.topology.areas if area != left])
+        part = frozenset[int]() if is_anywhere(known_from_visit) else graph.part_of(known)
+        areas = np.array([a for a in hypothesis.topology.areas if a != left and a in part])
         if not len(areas):
             return []
         extents = visits.extents(visit.visit)[areas]
@@ -174,13 +185,51 @@ class Transition:
         result = []
         # How well a place is known is asked of the nearest only: it costs more than all else here.
         for index in np.argsort(distances, kind="stable")[: _ASKED * most]:
-            area, distance = int(areas[index]), float(distances[index])
+            area = int(areas[index])
             prior = graph.relative(area, known) @ known_from_visit
-            if distance <= self._gate_sigma * prior.sigma_m and is_asked(prior):
-                result.append(_Candidate(area, prior, distance))
+            if distances[index] <= self._gate_sigma * prior.sigma_m and is_asked(prior):
+                result.append(_Candidate(area, prior))
                 if len(result) == most:
                     break
         return result
+
+    def _anywhere(
+        self,
+        hypothesis: Hypothesis,
+        visit: Visit,
+        known: int,
+        known_from_visit: GaussianPose,
+        visits: Visits,
+        mass: float,
+    ) -> list[_Candidate]:
+        """Return the areas that the visit may be to because nobody knows where those are.
+
+        A robot that wakes up is as likely beside one keyframe of the map as beside another, and may
+        be outside of all.
+
+        Args:
+            hypothesis: What is believed.
+            visit: The visit.
+            known: A visit that it has a motion from.
+            known_from_visit: That motion.
+            visits: All visits.
+            mass: Probability that it is in none of the areas whose place is known.
+        """
+        graph = hypothesis.graph
+        if graph.is_whole and not is_anywhere(known_from_visit):
+            return []
+        part = frozenset[int]() if is_anywhere(known_from_visit) else graph.part_of(known)
+        areas = [area for area in hypothesis.topology.areas if area not in part]
+        keyframes = sum(visits.keyframes(area) for area in areas)
+        inside = (1.0 - self._config.outside_share) * mass
+        return [
+            _Candidate(
+                area,
+                anywhere_in(visits[area], visit, self._config.presence_m),
+                inside * visits.keyframes(area) / keyframes,
+            )
+            for area in areas
+        ]
 
     def _mass_outside(
         self, candidates: list[_Candidate], visit: Visit, visits: Mapping[int, Visit]

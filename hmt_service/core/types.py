@@ -55,13 +55,14 @@ Reading = Scan | OdometryReading
 
 
 class TrackingFailure(StrEnum):
-    """Why a scan could not be tied to the scans before it."""
+    """Why a scan could not be tied to the scans before it; a new session has none before it."""
 
     TOO_FEW_POINTS = "too_few_points"
     TOO_FEW_CORRESPONDENCES = "too_few_correspondences"
     NOT_CONVERGED = "not_converged"
     CORRECTION_TOO_LARGE = "correction_too_large"
     GAP_IN_TIME = "gap_in_time"
+    NEW_SESSION = "new_session"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -12,7 +12,6 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
-from pydantic import ValidationError
 
 from hmt_service.core.config import Config
 from hmt_service.core.geometry import FloatArray, Pose, identity, inverse, transform_points
@@ -67,7 +66,7 @@ class PlacedMap:
             raise InvalidInput(f"visits {sorted(missing)} have no pose: the map is damaged")
         area_from_first = inverse(chosen.reference_from_visit[reference])
         poses = {v: area_from_first @ pose for v, pose in chosen.reference_from_visit.items()}
-        return cls(stored, _config(stored), chosen, reference, poses)
+        return cls(stored, stored.config, chosen, reference, poses)
 
     @cached_property
     def reference_from_keyframe(self) -> FloatArray:
@@ -131,10 +130,3 @@ def _hypothesis(stored: StoredMap, hypothesis: int | None) -> StoredHypothesis:
             return candidate
     identifiers = [h.hypothesis for h in stored.hypotheses]
     raise NotFound(f"hypothesis {hypothesis} is not one of {identifiers}")
-
-
-def _config(stored: StoredMap) -> Config:
-    try:
-        return Config.model_validate_json(stored.config_json)
-    except ValidationError as error:
-        raise InvalidInput(f"the map's settings are not of this version: {error}") from error

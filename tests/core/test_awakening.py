@@ -1,0 +1,144 @@
+"""A stored map goes on in a new session: who wakes up anywhere in it finds out where that is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hmt_service.core.awakening import is_anywhere
+from hmt_service.core.config import load_config
+from hmt_service.core.engine import Engine
+from hmt_service.core.geometry import Pose, identity, inverse, log, planar_pose
+from hmt_service.core.graph import Factor, PoseGraph
+from hmt_service.core.odometry import Odometry
+from hmt_service.core.types import EventKind, MapMethod, TrackingFailure
+from tests.core.factories import RING, Walls, box, drive, gaussian, motion_covariance, ring_path
+from tests.mapped import mapped
+
+LATER_S = 1000.0
+
+
+def travelled(engine: Engine, walls: Walls, path: Sequence[Pose]) -> Engine:
+    """Let an engine map a drive that begins with a new odometry."""
+    odometry = Odometry(load_config())
+    for reading in drive(walls, path, noise=np.random.default_rng(1)):
+        tracking = odometry.process(replace(reading, stamp_s=reading.stamp_s + LATER_S))
+        if tracking is not None:
+            assert not engine.misses(tracking)
+            engine.process(tracking)
+    return engine
+
+
+@pytest.fixture(scope="module")
+def ring() -> Engine:
+    """Return one lap around a block of rooms that differ."""
+    engine, odometry = Engine(load_config()), Odometry(load_config())
+    for reading in drive(RING, ring_path(laps=1.2), noise=np.random.default_rng(0)):
+        if (tracking := odometry.process(reading)) is not None:
+            engine.process(tracking)
+    engine.finish()
+    return engine
+
+
+@pytest.mark.parametrize("name", ["ring", "flat"])
+def test_a_restored_map_is_the_map(name: str, ring: Engine) -> None:
+    engine = ring if name == "ring" else mapped()
+    restored = Engine.restored(engine.stored())
+    for method in MapMethod:
+        was, now = (e.global_map(method) for e in (engine, restored))
+        assert now.probability == pytest.approx(was.probability)
+        assert [a.area for a in now.areas] == [a.area for a in was.areas]
+        for one, two in zip(now.areas, was.areas, strict=True):
+            assert (one.keyframes, one.visits) == (two.keyframes, two.visits)
+            assert np.array_equal(one.points_in_area.shape, two.points_in_area.shape)
+            gap = log(inverse(one.reference_from_area.mean) @ two.reference_from_area.mean)
+            assert np.abs(gap).max() < 1e-3
+            assert one.reference_from_area.covariance == pytest.approx(
+                two.reference_from_area.covariance, rel=0.3, abs=1e-5
+            )
+    again, first = restored.stored(), engine.stored()
+    assert again.visits == first.visits
+    assert len(again.keyframes) == len(first.keyframes)
+    assert len(again.scans) == len(first.scans)
+    assert again.config_json == first.config_json
+    assert [len(h.factors) for h in again.hypotheses] == [len(h.factors) for h in first.hypotheses]
+
+
+def test_who_wakes_up_in_a_known_place_knows_soon_where(ring: Engine) -> None:
+    known = ring.stored()
+    path = ring_path(laps=0.8)[20:60]
+    engine = travelled(Engine.restored(known), RING, path)
+    (lost, *_) = [e for e in engine.audit.events if e.kind is EventKind.LOST]
+    assert "new session" in lost.message
+    snapshot = engine.snapshot()
+    assert snapshot is not None
+    assert snapshot.posterior.hypotheses[0].probability > 0.95
+    # The first lap began at the first pose of the path: it is the frame of the map.
+    truth = inverse(ring_path(laps=0.8)[0]) @ path[-1]
+    last = engine.trajectory()[-1].reference_from_body
+    assert np.abs(log(inverse(truth) @ last)[3:]).max() < 0.1
+    assert snapshot.reference_from_keyframe.sigma_m < 0.5
+    stored = engine.stored()
+    begun = stored.keyframes[len(known.keyframes)]
+    assert begun.failure is TrackingFailure.NEW_SESSION
+    assert [k.index for k in stored.keyframes] == list(range(len(stored.keyframes)))
+    assert len(stored.scans) > len(known.scans)
+    # It can be told how the new session lies beside the old one along arcs, too.
+    shortest = engine.global_map(MapMethod.SHORTEST_PATH, with_points=False)
+    assert all(not is_anywhere(area.reference_from_area) for area in shortest.areas)
+
+
+def test_who_wakes_up_outside_is_in_a_part_of_its_own_until_a_known_place_comes(
+    ring: Engine,
+) -> None:
+    other = np.concatenate([box(0.0, 0.0, 9.0, 5.0), box(3.0, 3.0, 4.5, 3.6), box(6, 0.8, 7, 1.4)])
+    path = [planar_pose(1.5 + 0.1 * i, 2.0, 0.0) for i in range(40)]
+    engine = travelled(Engine.restored(ring.stored()), other, path)
+    snapshot = engine.snapshot()
+    assert snapshot is not None
+    assert is_anywhere(snapshot.reference_from_keyframe)
+    assert snapshot.posterior.current_area.get(len(ring.stored().visits), 0.0) > 0.7
+    # The next session wakes up in the old part, and may not take the new one for a neighbour.
+    again = travelled(Engine.restored(engine.stored()), RING, ring_path(laps=0.8)[20:60])
+    found = again.snapshot()
+    assert found is not None
+    assert found.posterior.current_area[found.posterior.hypotheses[0].current_area] > 0.95
+    assert not is_anywhere(found.reference_from_keyframe)
+
+
+def test_the_same_map_log_and_seed_give_the_same_map(ring: Engine) -> None:
+    stored, path = ring.stored(), ring_path(laps=0.8)[20:40]
+    one, two = (travelled(Engine.restored(stored, seed=3), RING, path).stored() for _ in range(2))
+    for first, second in zip(one.hypotheses, two.hypotheses, strict=True):
+        assert first.log_weight == second.log_weight
+        for visit, pose in first.reference_from_visit.items():
+            assert np.array_equal(pose, second.reference_from_visit[visit])
+
+
+def test_parts_that_nothing_ties_are_joined_where_an_arc_says() -> None:
+    graph = PoseGraph(is_planar=True)
+    graph.add_reference(0)
+    step, anywhere = planar_pose(2.0, 0.0, 0.1), gaussian(identity(), sigma_m=1e4, sigma_rad=1.8)
+    graph.add_factor(Factor(0, 1, gaussian(step)))
+    assert graph.is_whole
+    graph.add_factor(Factor(1, 2, anywhere))
+    graph.add_factor(Factor(2, 3, gaussian(step)))
+    assert not graph.is_whole
+    assert graph.part_of(1) == {0, 1}
+    assert graph.part_of(3) == {2, 3}
+    # The new part is far away, and turned by nearly half a turn.
+    truth = planar_pose(-40.0, 7.0, 3.0)
+    tie = gaussian(truth, sigma_m=0.02)
+    for joined in (graph.joined(Factor(1, 3, tie)), graph.joined(Factor(3, 1, tie.inverse()))):
+        assert joined.part_of(0) == {0, 1, 2, 3}
+        # The arc that says nothing pulls a little.
+        assert joined.relative(1, 3).mean == pytest.approx(truth, abs=1e-3)
+        assert joined.relative(2, 3).mean == pytest.approx(step, abs=1e-3)
+        assert joined.relative(1, 3).covariance[2:5, 2:5] == pytest.approx(
+            motion_covariance(0.01, 0.02)[2:5, 2:5], abs=1e-6
+        )
+        assert joined.pose(0) == pytest.approx(identity(), abs=1e-6)
+    assert not graph.has_arc(1, 3)
