@@ -336,6 +336,7 @@ def _status_rows(answer: Status) -> dict[str, str]:
         "scans": f"{answer.tracked_scans} tracked, {answer.processed_scans} in the map",
         "map": f"revision {answer.revision}: {answer.areas} areas, {answer.arcs} arcs, "
         f"{answer.keyframes} keyframes, {answer.hypotheses} hypotheses",
+        "stored": f"{answer.stored_keyframes} keyframes in the map file",
     }
     for process in answer.processes:
         readiness = "ready" if process.is_ready else "loading"

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hmt_service.cli.recorded import print_contents, print_malformed
-from hmt_service.cli.settings import ConfigFile, PresetName, Seed, load_settings
-from hmt_service.core.config import Preset
+from hmt_service.cli.settings import ConfigFile, OwnPreset, Seed, settings_of_map
+from hmt_service.errors import NotFound
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -28,18 +28,27 @@ if TYPE_CHECKING:
 def run(
     log: Annotated[Path, typer.Argument(help="Recorded log: CARMEN or MCAP.")],
     out: Annotated[Path, typer.Option(help="Folder to write trajectory, map and summary to.")],
-    preset: PresetName = Preset.PLANAR,
+    preset: OwnPreset = None,
     config: ConfigFile = None,
     seed: Seed = 0,
+    map_file: Annotated[
+        Path | None,
+        typer.Option(
+            "--map", help="Map file to go on with, from an unknown place; it is not changed."
+        ),
+    ] = None,
 ) -> None:
     """Build the map of a recorded log; the same log and seed give the same files, bit for bit."""
     from rich.console import Console
 
     from hmt_service.io.logs import read_log
+    from hmt_service.service.kept_map import KeptMap
     from hmt_service.service.results import save_results
 
     console = Console(stderr=True)
-    settings = load_settings(preset, config)
+    if map_file is not None and not map_file.is_file():
+        raise NotFound(f"map file {map_file} does not exist")
+    settings = settings_of_map(map_file, preset, config)
     with console.status(f"reading {log}"):
         recorded = read_log(
             log,
@@ -47,7 +56,8 @@ def run(
             max_range_m=settings.sensor.max_range_m,
         )
     print_contents(console, recorded)
-    engine, report = _map(recorded.readings, recorded.scans, settings, seed, console)
+    known = None if map_file is None else KeptMap(map_file).engine(settings, seed=seed)
+    engine, report = _map(recorded.readings, recorded.scans, settings, seed, known, console)
     print_malformed(console, recorded)
     files = save_results(engine, report, directory=out, config=settings, seed=seed)
     _report_map(console, engine, report)
@@ -55,7 +65,12 @@ def run(
 
 
 def _map(
-    readings: Iterable[Reading], scans: int, settings: Config, seed: int, console: Console
+    readings: Iterable[Reading],
+    scans: int,
+    settings: Config,
+    seed: int,
+    known: Engine | None,
+    console: Console,
 ) -> tuple[Engine, RunReport]:
     """Return the finished engine and what it has cost, with a progress bar meanwhile."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
@@ -70,6 +85,7 @@ def _map(
             readings,
             settings,
             seed=seed,
+            known=known,
             on_scan=lambda: progress.advance(task),
             on_event=lambda event: _warn(console, event),
         )

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hmt_service.cli.connection import Robot, Site
-from hmt_service.cli.settings import ConfigFile, PresetName, Seed, load_settings
-from hmt_service.core.config import Preset
+from hmt_service.cli.settings import ConfigFile, OwnPreset, Seed, settings_of_map
+from hmt_service.errors import NotFound
 from hmt_service.service.keys import DEFAULT_ENDPOINT, Keys
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ def serve(
     scouting: Annotated[
         bool, typer.Option("--scouting", help="Look for others on the network by multicast.")
     ] = False,
-    preset: PresetName = Preset.PLANAR,
+    preset: OwnPreset = None,
     config: ConfigFile = None,
     seed: Seed = 0,
     reorder_window: Annotated[
@@ -55,7 +55,15 @@ def serve(
         ),
     ] = 0.25,
     out: Annotated[
-        Path | None, typer.Option(help="Folder to save the map to; without it nothing is saved.")
+        Path | None, typer.Option(help="Folder to save the results to when the map is finished.")
+    ] = None,
+    map_file: Annotated[
+        Path | None,
+        typer.Option(
+            "--map",
+            help="Map file to go on with, from an unknown place; made if it does not exist. It is "
+            "written as the map grows: what `status` calls stored survives anything.",
+        ),
     ] = None,
 ) -> None:
     """Build the map of one robot from what it sends, and answer questions about it.
@@ -68,13 +76,16 @@ def serve(
 
     from hmt_service.service.daemon import Daemon, DaemonSettings
     from hmt_service.service.intake import IntakeLimits
+    from hmt_service.service.kept_map import KeptMap
     from hmt_service.service.results import save_results
     from hmt_service.service.session import Endpoints, Mode
 
     console = Console(stderr=True)
     handler = RichHandler(console=console, show_path=False)
     logging.basicConfig(level=logging.INFO, format="%(message)s", handlers=[handler])
-    settings = load_settings(preset, config)
+    settings = settings_of_map(map_file, preset, config)
+    if map_file is not None and not map_file.absolute().parent.is_dir():
+        raise NotFound(f"folder {map_file.absolute().parent} of the map file does not exist")
     listening = listen or ([] if connect else [DEFAULT_ENDPOINT])
     endpoints = Endpoints(
         # A router passes nothing between peers that cannot find each other: be its client.
@@ -93,6 +104,7 @@ def serve(
             config=settings,
             seed=seed,
             save=save,
+            keeper=None if map_file is None else KeptMap(map_file),
             limits=IntakeLimits(reorder_s=reorder_window),
         )
     )
@@ -101,7 +113,8 @@ def serve(
             on_open=lambda: console.print(f"serving site {site}, robot {robot} {endpoints}")
         )
     _print(console, report)
-    raise typer.Exit(_exit_code(report, is_saving=save is not None))
+    is_saving = save is not None or map_file is not None
+    raise typer.Exit(_exit_code(report, is_saving=is_saving))
 
 
 @contextmanager

@@ -11,14 +11,35 @@ from typing import Annotated
 import typer
 
 from hmt_service.core.config import Config, Preset, load_config
-from hmt_service.errors import NotFound
+from hmt_service.errors import InvalidInput, NotFound
 
 PresetName = Annotated[Preset, typer.Option("--preset", help="Kind of sensor.")]
+OwnPreset = Annotated[
+    Preset | None,
+    typer.Option("--preset", help=f"Kind of sensor; {Preset.PLANAR} if none is given."),
+]
 ConfigFile = Annotated[
     Path | None,
     typer.Option("--config", help="YAML file of settings that differ from the preset."),
 ]
 Seed = Annotated[int, typer.Option("--seed", min=0, help="Seed of all randomness.")]
+
+
+def settings_of_map(map_file: Path | None, preset: Preset | None, config: Path | None) -> Config:
+    """Return the settings of a map that goes on; of one that begins, those that are asked for.
+
+    Raises:
+        InvalidInput: If the map has settings and others are asked for, or the file is no map file.
+        NotFound: If the file of settings cannot be read.
+        InvalidConfig: If its content is refused.
+    """
+    if map_file is None or not map_file.exists():
+        return load_settings(preset or Preset.PLANAR, config)
+    if preset is not None or config is not None:
+        raise InvalidInput(f"{map_file} has settings of its own: leave out --preset and --config")
+    from hmt_service.io.map_file import read_config
+
+    return read_config(map_file)
 
 
 def load_settings(preset: Preset, config: Path | None) -> Config:

@@ -134,6 +134,7 @@ class EventKind(StrEnum):
     PROCESS_FAILED = "process_failed"
     PRESET_DOUBTED = "preset_doubted"
     PRESET_CONFIRMED = "preset_confirmed"
+    NOT_SAVED = "not_saved"
 
 
 @dataclass(frozen=True, slots=True)

@@ -30,6 +30,7 @@ _EIGENVALUE_TOLERANCE = 1e-6
 _MASS_TOLERANCE = 1e-6
 _POINT_BYTES = 12
 _SHOWN = 5
+_FIRST_WITH_DIGEST = 3
 _Row = Mapping[str, Any]
 _TYPES: Mapping[str, type] = {"TEXT": str, "INTEGER": int, "REAL": float, "BLOB": bytes}
 
@@ -56,7 +57,8 @@ def _violations(database: sqlite3.Connection) -> Iterator[str]:
     except (sqlite3.DatabaseError, UnicodeDecodeError) as error:
         yield f"database: {error}; the rest was not checked"
         return
-    yield from _meta({row["key"]: row["value"] for row in tables["meta"]}, digest)
+    (version,) = database.execute("PRAGMA user_version").fetchone()
+    yield from _meta({row["key"]: row["value"] for row in tables["meta"]}, digest, version)
     yield from _content(tables)
     keyframes = [row["keyframe"] for row in tables["keyframes"]]
     visits = [row["visit"] for row in tables["visits"]]
@@ -96,7 +98,9 @@ def _read(database: sqlite3.Connection, table: str, rows: list[_Row]) -> Iterato
             rows.append({column[1]: value for column, value in zip(columns, row, strict=True)})
 
 
-def _meta(meta: Mapping[str, str], digest: str) -> Iterator[str]:
+def _meta(meta: Mapping[str, str], digest: str, version: int) -> Iterator[str]:
+    if DIGEST not in meta and version >= _FIRST_WITH_DIGEST:
+        yield f"meta: {DIGEST} is missing"
     if meta.get(DIGEST, digest) != digest:
         yield f"meta: {DIGEST} is {meta[DIGEST][:12]}…, that of the content is {digest[:12]}…"
     for key, read in _META.items():
@@ -124,7 +128,6 @@ _META: Mapping[str, Callable[[str], object]] = {
     "seed": int,
     "config": Config.model_validate_json,
     "point_resolution_m": _resolution_m,
-    DIGEST: str,
 }
 
 

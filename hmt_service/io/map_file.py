@@ -25,6 +25,7 @@ import numpy as np
 import zstandard
 
 from hmt_service import __version__
+from hmt_service.core.config import Config
 from hmt_service.core.geometry import FloatArray, GaussianPose, Pose
 from hmt_service.core.stored import (
     StoredAssignment,
@@ -37,8 +38,10 @@ from hmt_service.core.stored import (
 from hmt_service.core.types import NO_POINTS, Keyframe, Points, TrackingFailure
 from hmt_service.errors import InvalidInput, NotFound, Unavailable
 
-SCHEMA_VERSION = 2
-"""Version of the tables, in `PRAGMA user_version`."""
+SCHEMA_VERSION = 3
+"""Version of what is written, in `PRAGMA user_version`."""
+_READABLE = (2, 3)
+"""Versions that are read. In 3 there may be several sessions, and always a digest."""
 POINT_RESOLUTION_M = 0.005
 """Edge of the grid that points are rounded to."""
 
@@ -139,6 +142,17 @@ def read_map(path: Path, *, with_points: bool = True) -> StoredMap:
         return _read(database, with_points=with_points)
 
 
+def read_config(path: Path) -> Config:
+    """Read the settings that a map was built with.
+
+    Raises:
+        NotFound: If there is no such file.
+        InvalidInput: If it is no map file, is damaged or was written by another version.
+    """
+    # Visits and hypotheses too: what is damaged is found out before anything begins.
+    return read_map(path, with_points=False).config
+
+
 @contextmanager
 def opened(path: Path) -> Iterator[sqlite3.Connection]:
     """Open a map file for reading; what cannot be read meanwhile is told of the file.
@@ -155,7 +169,8 @@ def opened(path: Path) -> Iterator[sqlite3.Connection]:
     try:
         with closing(sqlite3.connect(uri, uri=True)) as database:
             yield database
-    except (sqlite3.DatabaseError, zstandard.ZstdError, KeyError, ValueError) as error:
+    # Damaged pages may hold any value of any type.
+    except (sqlite3.DatabaseError, zstandard.ZstdError, KeyError, TypeError, ValueError) as error:
         size = path.stat().st_size
         raise InvalidInput(f"{path} ({size} bytes) is no map file or damaged: {error}") from error
 
@@ -185,9 +200,10 @@ def _check_version(path: Path) -> None:
             f"{path} is an SQLite file of another application "
             f"(id {application:#x}, a map file has {_APPLICATION_ID:#x})"
         )
-    if version != SCHEMA_VERSION:
+    if version not in _READABLE:
         raise InvalidInput(
-            f"{path} has schema version {version}, this program reads version {SCHEMA_VERSION}"
+            f"{path} has schema version {version}, this program reads versions "
+            f"{_READABLE[0]} to {_READABLE[-1]}"
         )
 
 

@@ -17,7 +17,7 @@ import zstandard
 
 from hmt_service.core.config import Preset, load_config
 from hmt_service.core.stored import StoredHypothesis
-from hmt_service.io.map_file import SCHEMA_VERSION, opened, read_map
+from hmt_service.io.map_file import opened, read_map
 from hmt_service.io.placed_map import PlacedMap
 
 _POINT_BYTES = 12
@@ -92,6 +92,7 @@ def map_info(path: Path) -> MapInfo:
     stored, config = placed.stored, placed.config
     with opened(path) as database:
         meta = dict(database.execute("SELECT key, value FROM meta"))
+        (version,) = database.execute("PRAGMA user_version").fetchone()
         points = _points(database)
         created_by, resolution_m = meta["created_by"], float(meta["point_resolution_m"])
     stamps_s = [scan.stamp_s for scan in stored.scans]
@@ -100,7 +101,7 @@ def map_info(path: Path) -> MapInfo:
     ordered = sorted(stored.hypotheses, key=lambda h: -h.log_weight)
     return MapInfo(
         file_bytes=path.stat().st_size,
-        schema_version=SCHEMA_VERSION,
+        schema_version=version,
         created_by=created_by,
         revision=stored.revision,
         seed=stored.seed,

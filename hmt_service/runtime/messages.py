@@ -15,9 +15,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
 from multiprocessing.reduction import ForkingPickler
+from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
+from hmt_service.core.config import Config
 from hmt_service.core.types import (
     Comparison,
     Event,
@@ -82,6 +84,8 @@ class RunReport:
     """Time that the odometry has worked, s of the wall clock."""
     topology_busy_s: float
     """Time that the topology has worked, s of the wall clock."""
+    stored_keyframes: int = 0
+    """Keyframes that are in the map file, whatever happens now."""
 
     @property
     def busy_s(self) -> float:
@@ -182,6 +186,21 @@ Request = MapRequest | CompareRequest | SaveRequest
 """What the topology process can be asked."""
 Result = GlobalMap | Comparison | tuple[str, ...] | HmtError
 """Its answers: a map, a comparison, the names of saved files, or why not."""
+
+
+class Keeper(Protocol):
+    """Owner of a map file, in the topology process: picklable."""
+
+    @property
+    def path(self) -> Path:
+        """The file."""
+
+    def engine(self, config: Config, *, seed: int) -> Engine:
+        """Return an engine that goes on with the map in the file, or begins one."""
+
+    def write(self, engine: Engine) -> None:
+        """Write the map: the file holds either the one before or all of this one."""
+
 
 Save = Callable[["Engine", RunReport], tuple[str, ...]]
 """Writes the results and returns the files' names; picklable, for the topology process runs it."""

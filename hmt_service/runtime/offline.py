@@ -21,6 +21,7 @@ def map_readings(
     config: Config,
     *,
     seed: int = 0,
+    known: Engine | None = None,
     on_scan: Callable[[], object] = lambda: None,
     on_event: Callable[[Event], object] = lambda _: None,
 ) -> tuple[Engine, RunReport]:
@@ -30,10 +31,11 @@ def map_readings(
         readings: In the order of time.
         config: Settings of all stages.
         seed: Seed of all randomness.
+        known: Engine of a map to go on with, of these settings; None to begin one.
         on_scan: Called after each scan.
         on_event: Called with everything that happens to the map, before `on_scan`.
     """
-    odometry, engine = Odometry(config), Engine(config, seed=seed)
+    odometry, engine = Odometry(config), known or Engine(config, seed=seed)
     scans, odometry_busy_s, topology_busy_s = 0, 0.0, 0.0
     for reading in readings:
         started_s = time.perf_counter()

@@ -30,6 +30,7 @@ from hmt_service.errors import DeadlineExceeded, Unavailable
 from hmt_service.runtime.links import Link
 from hmt_service.runtime.messages import (
     Finish,
+    Keeper,
     Mapped,
     ProcessFailure,
     ProcessName,
@@ -73,7 +74,14 @@ class _Pending:
 class Pipeline:
     """Owner of both child processes and of the pipes to them."""
 
-    def __init__(self, config: Config, *, seed: int = 0, save: Save | None = None) -> None:
+    def __init__(
+        self,
+        config: Config,
+        *,
+        seed: int = 0,
+        save: Save | None = None,
+        keeper: Keeper | None = None,
+    ) -> None:
         """Prepare; `start` starts.
 
         Args:
@@ -81,10 +89,13 @@ class Pipeline:
             seed: Seed of the engine's random generator.
             save: Writes the results, in the topology process, when the map is finished or saved;
                 None for never.
+            keeper: Reads the map that the topology process goes on with, and writes it as it grows;
+                None for none.
         """
         self._config = config
         self._seed = seed
         self._save = save
+        self._keeper = keeper
         self._progress = Tracked(None, 0, 0.0)
         self._tracked_scans = 0
         self._report = RunReport(0, 0.0, 0.0)
@@ -104,7 +115,14 @@ class Pipeline:
             ),
             ProcessName.TOPOLOGY: context.Process(
                 target=run_topology,
-                args=(for_topology, for_requests, self._config, self._seed, self._save),
+                args=(
+                    for_topology,
+                    for_requests,
+                    self._config,
+                    self._seed,
+                    self._save,
+                    self._keeper,
+                ),
                 name="hmt-topology",
             ),
         }

@@ -10,6 +10,7 @@ References:
 from __future__ import annotations
 
 import logging
+import math
 import signal
 import time
 from collections import deque
@@ -18,12 +19,13 @@ from multiprocessing.connection import Connection, wait
 from typing import Any, TypeVar
 
 from hmt_service.core.config import Config
-from hmt_service.core.types import Event
+from hmt_service.core.types import Event, EventKind
 from hmt_service.errors import DaemonFailure, HmtError, Unavailable
 from hmt_service.runtime.messages import (
     CompareRequest,
     Finish,
     Finished,
+    Keeper,
     Mapped,
     MapRequest,
     Ready,
@@ -39,6 +41,8 @@ from hmt_service.runtime.messages import (
 )
 
 _LOG = logging.getLogger(__name__)
+# The map file is written this often, and takes no larger share of the time.
+_KEEP_S, _KEEP_SHARE = 1.0, 0.05
 
 T = TypeVar("T")
 
@@ -63,13 +67,19 @@ def run_odometry(work: Connection, config: Config) -> None:
 
 
 def run_topology(
-    work: Connection, requests: Connection, config: Config, seed: int, save: Save | None
+    work: Connection,
+    requests: Connection,
+    config: Config,
+    seed: int,
+    save: Save | None,
+    keeper: Keeper | None,
 ) -> None:
     """Turn trackings into the map until the pipes end, and answer requests between two scans."""
     _leave_signals_to_parent()
-    topology = _Topology(config, seed, save)
+    topology = _Topology(config, seed, save, keeper)
     _send(work, Ready())
-    for connection, message in _received(requests, work):
+    # What is written while nothing comes is told with the next answer.
+    for connection, message in _received(requests, work, idle=topology.keep):
         if connection is requests:
             _send(requests, topology.answer(message))
         elif isinstance(message, Finish):
@@ -81,11 +91,16 @@ def run_topology(
 class _Topology:
     """The engine, what it has cost, and where it is saved."""
 
-    def __init__(self, config: Config, seed: int, save: Save | None) -> None:
+    def __init__(self, config: Config, seed: int, save: Save | None, keeper: Keeper | None) -> None:
         from hmt_service.core.engine import Engine
 
-        self._engine = Engine(config, seed=seed)
+        restored = None if keeper is None else keeper.engine(config, seed=seed)
+        self._engine = restored or Engine(config, seed=seed)
         self._save = save
+        self._keeper = keeper
+        self._stored_keyframes = self._keyframes
+        self._kept_s = -math.inf
+        self._pause_s = _KEEP_S
         self._scans = 0
         self._odometry_busy_s = 0.0
         self._busy_s = 0.0
@@ -103,6 +118,7 @@ class _Topology:
         self._busy_s += time.perf_counter() - started
         self._scans += 1
         self._odometry_busy_s = tracked.busy_s
+        events = (*events, *self.keep())
         has_changed = tracked.tracking.keyframe is not None or bool(events)
         return Mapped(self._engine.snapshot() if has_changed else None, events, self._report())
 
@@ -119,8 +135,7 @@ class _Topology:
         started = time.perf_counter()
         events = self._engine.finish(is_urgent=is_urgent)
         self._busy_s += time.perf_counter() - started
-        save = self._save
-        saved = () if save is None else _guarded(lambda: save(self._engine, self._report()))
+        saved = _guarded(self._write)
         if isinstance(saved, HmtError):
             return events, Finished(number, (), str(saved))
         return events, Finished(number, saved)
@@ -143,12 +158,46 @@ class _Topology:
                     reference_area=request.reference_area, hypothesis=request.hypothesis
                 )
             case SaveRequest():
-                if self._save is None:
-                    raise Unavailable("the daemon has no output folder to save to")
-                return self._save(self._engine, self._report())
+                if self._save is None and self._keeper is None:
+                    raise Unavailable("the daemon has no output folder and no map file to save to")
+                return self._write()
+
+    def _write(self) -> tuple[str, ...]:
+        """Write all results, and the map file."""
+        files: tuple[str, ...] = ()
+        if self._save is not None:
+            files = self._save(self._engine, self._report())
+        if self._keeper is not None and self._keyframes > 0:
+            self._keeper.write(self._engine)
+            self._stored_keyframes = self._keyframes
+            files = (*files, str(self._keeper.path))
+        return files
+
+    def keep(self) -> tuple[Event, ...]:
+        """Write the map file if it lacks keyframes, but not all the time; say what went wrong."""
+        keeper, started_s = self._keeper, time.monotonic()
+        if keeper is None or self._keyframes == self._stored_keyframes:
+            return ()
+        if started_s - self._kept_s < self._pause_s:
+            return ()
+        failed = _guarded(lambda: keeper.write(self._engine))
+        self._kept_s = time.monotonic()
+        self._pause_s = max(_KEEP_S, (self._kept_s - started_s) / _KEEP_SHARE)
+        if failed is None:
+            self._stored_keyframes = self._keyframes
+            return ()
+        numbers = {"keyframes": float(self._keyframes), "stored": float(self._stored_keyframes)}
+        snapshot = self._engine.snapshot()
+        stamp_s = 0.0 if snapshot is None else snapshot.posterior.stamp_s
+        return (Event(EventKind.NOT_SAVED, stamp_s, str(failed), numbers),)
+
+    @property
+    def _keyframes(self) -> int:
+        snapshot = self._engine.snapshot()
+        return 0 if snapshot is None else snapshot.keyframes
 
     def _report(self) -> RunReport:
-        return RunReport(self._scans, self._odometry_busy_s, self._busy_s)
+        return RunReport(self._scans, self._odometry_busy_s, self._busy_s, self._stored_keyframes)
 
 
 def _guarded(answer: Callable[[], T]) -> T | HmtError:
@@ -178,11 +227,21 @@ def _send(connection: Connection, message: object) -> None:
         raise SystemExit from error  # the parent is gone
 
 
-def _received(*connections: Connection) -> Iterator[tuple[Connection, Any]]:
-    """Yield messages until told to stop; connections that have one take turns."""
+def _received(
+    *connections: Connection, idle: Callable[[], object] = lambda: None
+) -> Iterator[tuple[Connection, Any]]:
+    """Yield messages until told to stop; connections that have one take turns.
+
+    Args:
+        connections: Where messages come from.
+        idle: Called now and then while there is none.
+    """
     turns = deque(connections)
     while True:
-        ready = wait(connections)
+        ready = wait(connections, _KEEP_S)
+        if not ready:
+            idle()
+            continue
         connection = next(c for c in turns if c in ready)
         turns.remove(connection)
         turns.append(connection)

@@ -368,6 +368,7 @@ def _status_to_proto(status: Status) -> pb.Status:
         arcs=status.arcs,
         keyframes=status.keyframes,
         hypotheses=status.hypotheses,
+        stored_keyframes=status.stored_keyframes,
     )
 
 
@@ -406,6 +407,7 @@ def _status(message: pb.Status) -> Status:
         arcs=message.arcs,
         keyframes=message.keyframes,
         hypotheses=message.hypotheses,
+        stored_keyframes=message.stored_keyframes,
     )
 
 

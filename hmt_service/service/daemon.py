@@ -16,7 +16,7 @@ import zenoh
 from hmt_service.core.config import Config
 from hmt_service.core.types import Event, EventKind
 from hmt_service.errors import DaemonFailure
-from hmt_service.runtime.messages import Finished, ProcessFailure, ProcessName, Save
+from hmt_service.runtime.messages import Finished, Keeper, ProcessFailure, ProcessName, Save
 from hmt_service.runtime.pipeline import Pipeline
 from hmt_service.service.gateway import Gateway
 from hmt_service.service.intake import IntakeLimits
@@ -48,6 +48,8 @@ class DaemonSettings:
     """Seed of the engine's random generator."""
     save: Save | None = None
     """Writes the results, in the topology process; None for never."""
+    keeper: Keeper | None = None
+    """Owner of the map file that the map goes on in; None for none."""
     limits: IntakeLimits = field(default_factory=IntakeLimits)
     """What may wait at the input."""
 
@@ -101,7 +103,9 @@ class Daemon:
         settings = self._settings
         with open_session(settings.endpoints) as session:
             _refuse_second(session, settings.keys)
-            pipeline = Pipeline(settings.config, seed=settings.seed, save=settings.save)
+            pipeline = Pipeline(
+                settings.config, seed=settings.seed, save=settings.save, keeper=settings.keeper
+            )
             gateway = Gateway(
                 session,
                 settings.keys,

@@ -45,6 +45,7 @@ from hmt_service.service.questions import Name, Question, receive
 from hmt_service.service.reports import Ack, DaemonState, Status
 
 _LOG = logging.getLogger(__name__)
+_WARNINGS = (EventKind.PRESET_DOUBTED, EventKind.NOT_SAVED)
 _KEPT_EVENTS = 1000
 _KEPT_BELIEFS = 20_000
 _ANSWER_S = 8.0
@@ -171,7 +172,7 @@ class Gateway:
     def publish(self, events: Iterable[Event]) -> None:
         """Keep, log and publish events."""
         for event in events:
-            level = logging.WARNING if event.kind is EventKind.PRESET_DOUBTED else logging.INFO
+            level = logging.WARNING if event.kind in _WARNINGS else logging.INFO
             _LOG.log(level, "%s: %s", event.kind, event.message)
             self._audit.note([event])
             self._put(Topic.EVENT, event)
@@ -193,6 +194,7 @@ class Gateway:
             arcs=snapshot.arcs if snapshot else 0,
             keyframes=snapshot.keyframes if snapshot else 0,
             hypotheses=len(snapshot.posterior.hypotheses) if snapshot else 0,
+            stored_keyframes=self._report.stored_keyframes,
         )
 
     def on_tracking(self, tracking: Tracking) -> None:

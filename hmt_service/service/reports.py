@@ -76,6 +76,8 @@ class Status:
     """Keyframes in the map."""
     hypotheses: int
     """Hypotheses alive."""
+    stored_keyframes: int
+    """Keyframes that are in the map file, whatever happens now; zero without one."""
 
 
 @dataclass(frozen=True, slots=True)

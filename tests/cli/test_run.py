@@ -11,7 +11,8 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from hmt_service.cli.app import app
-from hmt_service.core.geometry import yaw_of
+from hmt_service.core.geometry import inverse, yaw_of
+from hmt_service.io.map_check import check_map
 from hmt_service.io.map_file import read_map
 from hmt_service.io.relations import evaluate, read_relations
 from hmt_service.io.trajectory import read_tum
@@ -73,6 +74,29 @@ def test_same_log_and_seed_give_the_same_bytes(log: Path, tmp_path: Path) -> Non
     for file in ("trajectory.tum", "map.hmt", "events.jsonl", "posterior.jsonl"):
         first, second = ((tmp_path / name / file).read_bytes() for name in ("first", "second"))
         assert first == second
+
+
+def test_a_map_goes_on_with_another_log(log: Path, tmp_path: Path) -> None:
+    run(log, tmp_path / "first")
+    known = tmp_path / "first" / "map.hmt"
+    before = known.read_bytes()
+    for name in ("second", "again"):
+        assert run(log, tmp_path / name, "--map", str(known)).exit_code == 0
+    assert known.read_bytes() == before
+    second, again = (tmp_path / name / "map.hmt" for name in ("second", "again"))
+    assert second.read_bytes() == again.read_bytes()
+    assert check_map(second) == ()
+    first, both = read_map(known), read_map(second)
+    assert len(both.scans) == 2 * len(first.scans)
+    assert len(both.keyframes) == 2 * len(first.keyframes)
+    # Where it went on is where it had begun.
+    last, end = read_tum(second.with_name("trajectory.tum"))[-1], path(SCANS)
+    truth = inverse(end[0]) @ end[-1]
+    assert last.reference_from_body[:2, 3] == pytest.approx(truth[:2, 3], abs=0.1)
+    other = run(log, tmp_path / "third", "--map", str(known), "--preset", "2d")
+    assert "has settings of its own" in str(other.exception)
+    missing = run(log, tmp_path / "third", "--map", str(tmp_path / "none.hmt"))
+    assert "does not exist" in str(missing.exception)
 
 
 def test_summary_and_map_file_agree(log: Path, tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from hmt_service.core.engine import Engine
 from hmt_service.core.geometry import GaussianPose, Pose, exp
 from hmt_service.core.stored import (
     StoredAssignment,
@@ -20,9 +21,11 @@ from hmt_service.core.stored import (
     StoredScan,
     StoredVisit,
 )
-from hmt_service.core.types import Keyframe, Points, TrackingFailure
+from hmt_service.core.types import Keyframe, MapMethod, Points, TrackingFailure
 from hmt_service.errors import InvalidInput, NotFound, Unavailable
+from hmt_service.io.map_check import check_map
 from hmt_service.io.map_file import POINT_RESOLUTION_M, SCHEMA_VERSION, read_map, write_map
+from hmt_service.io.map_info import map_info
 
 
 def random_pose(rng: np.random.Generator) -> Pose:
@@ -252,9 +255,22 @@ def test_newer_schema_is_refused_with_both_versions(tmp_path: Path) -> None:
     with closing(sqlite3.connect(path)) as database:
         database.execute(f"PRAGMA user_version = {SCHEMA_VERSION + 1}")
     with pytest.raises(
-        InvalidInput, match=f"version {SCHEMA_VERSION + 1}.* version {SCHEMA_VERSION}"
+        InvalidInput, match=f"version {SCHEMA_VERSION + 1}.* versions 2 to {SCHEMA_VERSION}"
     ):
         read_map(path)
+
+
+@pytest.mark.parametrize("version", range(2, SCHEMA_VERSION + 1))
+def test_every_version_that_was_ever_written_is_read(version: int) -> None:
+    # The same map, written by the programs of their time; never to be written anew.
+    path = Path(__file__).parent / "golden" / f"map_v{version}.hmt"
+    stored = read_map(path)
+    assert (len(stored.keyframes), len(stored.scans), len(stored.visits)) == (22, 110, 1)
+    assert check_map(path) == ()
+    assert map_info(path).schema_version == version
+    (area,) = Engine.restored(stored).global_map(MapMethod.CONSISTENT).areas
+    assert area.keyframes == 22
+    assert len(area.points_in_area) > 100
 
 
 @pytest.mark.parametrize("share", [0.0, 0.01, 0.3, 0.6, 0.9])

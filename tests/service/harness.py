@@ -52,6 +52,7 @@ def running_daemon(
     router: str | None = None,
     is_awaited: bool = True,
     preset: Preset = Preset.PLANAR,
+    map_file: Path | None = None,
 ) -> Iterator[RunningDaemon]:
     """Run a daemon that is killed at the end.
 
@@ -60,14 +61,19 @@ def running_daemon(
         router: Endpoint of a router to reach it through, instead of its own.
         is_awaited: Whether it shall be ready for work.
         preset: Kind of sensor that it expects.
+        map_file: Map file to go on with.
     """
     endpoint = router or free_endpoint()
     settings = out.parent / "settings.yaml"
     settings.write_text(SETTINGS)
-    command = [sys.executable, "-m", "hmt_service", "serve", "--preset", preset]
+    command = [sys.executable, "-m", "hmt_service", "serve", "--out", str(out)]
+    if map_file is not None:
+        command += ["--map", str(map_file)]
+    if map_file is None or not map_file.exists():
+        command += ["--preset", preset, "--config", str(settings)]
     meeting = ["--connect", router] if router else ["--listen", endpoint]
     with subprocess.Popen(
-        [*command, *meeting, "--config", str(settings), "--out", str(out)],
+        [*command, *meeting],
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,

@@ -115,6 +115,7 @@ statuses = st.builds(
     ids,
     ids,
     ids,
+    ids,
 )
 acks = st.builds(Ack, counts, counts, counts, counts, st.lists(texts, max_size=3).map(tuple))
 

@@ -25,6 +25,7 @@ class EventKind(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     EVENT_KIND_PROCESS_FAILED: _ClassVar[EventKind]
     EVENT_KIND_PRESET_DOUBTED: _ClassVar[EventKind]
     EVENT_KIND_PRESET_CONFIRMED: _ClassVar[EventKind]
+    EVENT_KIND_NOT_SAVED: _ClassVar[EventKind]
 
 class DaemonState(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
@@ -54,6 +55,7 @@ EVENT_KIND_LOST: EventKind
 EVENT_KIND_PROCESS_FAILED: EventKind
 EVENT_KIND_PRESET_DOUBTED: EventKind
 EVENT_KIND_PRESET_CONFIRMED: EventKind
+EVENT_KIND_NOT_SAVED: EventKind
 DAEMON_STATE_UNSPECIFIED: DaemonState
 DAEMON_STATE_STARTING: DaemonState
 DAEMON_STATE_RUNNING: DaemonState
@@ -325,7 +327,7 @@ class InputCounts(_message.Message):
     def __init__(self, received: _Optional[int] = ..., accepted: _Optional[int] = ..., refused: _Optional[_Mapping[str, int]] = ..., queued: _Optional[int] = ..., queued_bytes: _Optional[int] = ..., discarded: _Optional[int] = ..., reordering: _Optional[int] = ..., dropped_beams: _Optional[_Mapping[str, int]] = ...) -> None: ...
 
 class Status(_message.Message):
-    __slots__ = ("version", "config_hash", "state", "uptime_s", "input", "tracked_scans", "processed_scans", "processes", "revision", "areas", "arcs", "keyframes", "hypotheses")
+    __slots__ = ("version", "config_hash", "state", "uptime_s", "input", "tracked_scans", "processed_scans", "processes", "revision", "areas", "arcs", "keyframes", "hypotheses", "stored_keyframes")
     VERSION_FIELD_NUMBER: _ClassVar[int]
     CONFIG_HASH_FIELD_NUMBER: _ClassVar[int]
     STATE_FIELD_NUMBER: _ClassVar[int]
@@ -339,6 +341,7 @@ class Status(_message.Message):
     ARCS_FIELD_NUMBER: _ClassVar[int]
     KEYFRAMES_FIELD_NUMBER: _ClassVar[int]
     HYPOTHESES_FIELD_NUMBER: _ClassVar[int]
+    STORED_KEYFRAMES_FIELD_NUMBER: _ClassVar[int]
     version: str
     config_hash: str
     state: DaemonState
@@ -352,7 +355,8 @@ class Status(_message.Message):
     arcs: int
     keyframes: int
     hypotheses: int
-    def __init__(self, version: _Optional[str] = ..., config_hash: _Optional[str] = ..., state: _Optional[_Union[DaemonState, str]] = ..., uptime_s: _Optional[float] = ..., input: _Optional[_Union[InputCounts, _Mapping]] = ..., tracked_scans: _Optional[int] = ..., processed_scans: _Optional[int] = ..., processes: _Optional[_Iterable[_Union[ProcessStatus, _Mapping]]] = ..., revision: _Optional[int] = ..., areas: _Optional[int] = ..., arcs: _Optional[int] = ..., keyframes: _Optional[int] = ..., hypotheses: _Optional[int] = ...) -> None: ...
+    stored_keyframes: int
+    def __init__(self, version: _Optional[str] = ..., config_hash: _Optional[str] = ..., state: _Optional[_Union[DaemonState, str]] = ..., uptime_s: _Optional[float] = ..., input: _Optional[_Union[InputCounts, _Mapping]] = ..., tracked_scans: _Optional[int] = ..., processed_scans: _Optional[int] = ..., processes: _Optional[_Iterable[_Union[ProcessStatus, _Mapping]]] = ..., revision: _Optional[int] = ..., areas: _Optional[int] = ..., arcs: _Optional[int] = ..., keyframes: _Optional[int] = ..., hypotheses: _Optional[int] = ..., stored_keyframes: _Optional[int] = ...) -> None: ...
 
 class Ack(_message.Message):
     __slots__ = ("received", "accepted", "refused", "processed_scans", "files")

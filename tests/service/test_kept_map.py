@@ -1,0 +1,131 @@
+"""The map file of a daemon: what is said to be stored survives anything, and goes on."""
+
+from __future__ import annotations
+
+import os
+import signal
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from hmt_service.cli.app import app
+from hmt_service.core.geometry import inverse
+from hmt_service.core.types import EventKind, TrackingFailure
+from hmt_service.io.map_check import check_map
+from hmt_service.io.map_file import read_map, write_map
+from hmt_service.runtime.messages import ProcessName
+from hmt_service.service.client import HmtClient
+from tests.flat import path, readings
+from tests.mapped import map_file_in, mapped
+from tests.service.harness import running_daemon, wait_until
+
+KILLS = 6
+
+
+def publish(client: HmtClient, first: int, last: int, *, later_s: float = 0.0) -> None:
+    for reading in list(readings(last))[2 * first : 2 * last]:
+        client.publish(replace(reading, stamp_s=reading.stamp_s + later_s))
+
+
+@pytest.mark.parametrize("victim", [ProcessName.TOPOLOGY, ProcessName.ODOMETRY, None])
+def test_what_is_stored_survives_a_kill_at_any_moment(
+    tmp_path: Path, victim: ProcessName | None
+) -> None:
+    """None: all of them at once."""
+    rng, known = np.random.default_rng(3), tmp_path / "known.hmt"
+    stored = 0
+    for kill in range(KILLS // 3):
+        with (
+            running_daemon(tmp_path / "out", map_file=known) as daemon,
+            daemon.client() as client,
+        ):
+            publish(client, 0, 100, later_s=1e4 * kill)
+            wait_until(lambda c=client, s=stored: c.status().stored_keyframes > s)  # type: ignore[misc]
+            publish(client, 100, 300, later_s=1e4 * kill)
+            moment = rng.integers(0, 200)
+            wait_until(lambda c=client, m=moment: c.status().processed_scans > 100 + m)  # type: ignore[misc]
+            status = client.status()
+            stored = status.stored_keyframes
+            processes = {process.name: process.pid for process in status.processes}
+            if victim is None:
+                daemon.process.kill()
+                for pid in processes.values():
+                    os.kill(pid, signal.SIGKILL)
+            else:
+                os.kill(processes[victim], signal.SIGKILL)
+            daemon.process.wait(10.0)
+        assert check_map(known) == ()
+        held = read_map(known)
+        assert len(held.keyframes) >= stored > 0
+    # Every daemon went on with what the one before had stored.
+    begun = [k for k in held.keyframes if k.failure is TrackingFailure.NEW_SESSION]
+    assert len(begun) == KILLS // 3 - 1
+
+
+def test_a_daemon_goes_on_with_a_map_and_says_where_it_is(tmp_path: Path) -> None:
+    known = map_file_in(tmp_path)
+    before = read_map(known)
+    with running_daemon(tmp_path / "out", map_file=known) as daemon, daemon.client() as client:
+        publish(client, 0, 120, later_s=1e4)
+        wait_until(lambda: client.status().processed_scans == 120)
+        (lost,) = [e for e in client.events() if e.kind is EventKind.LOST]
+        assert "new session" in lost.message
+        # It woke up where the map began, and has gone to the other room.
+        assert max(client.posterior().current_area.values()) > 0.8
+        pose, truth = client.pose().reference_from_body, inverse(path(120)[0]) @ path(120)[-1]
+        assert pose.mean[:2, 3] == pytest.approx(truth[:2, 3], abs=0.1)
+        assert pose.sigma_m < 0.5
+        assert str(known) in client.save().files
+    after = read_map(known)
+    assert len(after.keyframes) > len(before.keyframes)
+    assert after.config_json == before.config_json
+    assert check_map(known) == ()
+
+
+def test_a_map_file_that_cannot_be_written_is_an_event_and_keeps_what_it_held(
+    tmp_path: Path,
+) -> None:
+    folder = tmp_path / "maps"
+    folder.mkdir()
+    known = map_file_in(folder)
+    before = known.read_bytes()
+    with running_daemon(tmp_path / "out", map_file=known) as daemon, daemon.client() as client:
+        # Nothing can be put beside it, not even by root.
+        (folder / f"{known.name}.partial").mkdir()
+        publish(client, 0, 100, later_s=1e4)
+        wait_until(lambda: any(e.kind is EventKind.NOT_SAVED for e in client.events()))
+        status = client.status()
+        assert status.stored_keyframes == len(mapped().stored().keyframes)
+        assert status.processed_scans > 0
+    assert known.read_bytes() == before
+
+
+@pytest.mark.parametrize("command", ["serve", "run"])
+def test_a_file_that_is_no_map_of_this_version_is_refused_and_left_alone(
+    tmp_path: Path, command: str
+) -> None:
+    known = map_file_in(tmp_path)
+    damaged = known.read_bytes()[:-3000]
+    known.write_bytes(damaged)
+    log = [str(tmp_path / "log.mcap"), "--out", str(tmp_path / "out")] if command == "run" else []
+    result = CliRunner().invoke(app, [command, *log, "--map", str(known)])
+    assert result.exit_code != 0
+    assert result.exception is not None
+    assert "no map file or damaged" in str(result.exception)
+    assert known.read_bytes() == damaged
+
+
+def test_settings_of_a_map_that_goes_on_are_its_own(tmp_path: Path) -> None:
+    known = map_file_in(tmp_path)
+    result = CliRunner().invoke(app, ["serve", "--map", str(known), "--preset", "2d"])
+    assert "has settings of its own" in str(result.exception)
+
+
+def test_a_map_written_again_is_the_same_file(tmp_path: Path) -> None:
+    known = map_file_in(tmp_path)
+    written = known.read_bytes()
+    write_map(known, read_map(known))
+    assert known.read_bytes() == written
