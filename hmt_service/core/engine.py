@@ -196,7 +196,18 @@ class Engine:
             return (lost, *self._divide(extended))
         self._visits.put(extended)  # metric SLAM
         events = self._weigh(keyframe)  # Eq. (12)
-        return (*events, *self._divide(extended))
+        return (*events, *self._look_again(extended), *self._divide(extended))
+
+    def _look_again(self, visit: Visit) -> tuple[Event, ...]:
+        """Place a visit that began nowhere with all that it has seen, each time that has doubled.
+
+        One scan was all that there was to find its place with, and to tell how it is turned.
+        """
+        keyframes, stamp_s = len(visit.keyframes), visit.keyframes[-1].stamp_s
+        is_due = keyframes >= _LEAST_LOOK and keyframes.bit_count() == 1
+        if visit.keyframes[0].failure is None or not is_due:
+            return ()
+        return (*self._refine(visit, stamp_s), *self._recognise(visit, stamp_s))
 
     def _divide(self, visit: Visit) -> tuple[Event, ...]:
         """Enter another area if the robot has left the one of the open visit."""
@@ -605,6 +616,8 @@ class Engine:
 
 
 _ANY_CUT = 2.0
+# From so many keyframes on there is more to see than at first.
+_LEAST_LOOK = 4
 # A gap that the wheels bridge so well is none.
 _BRIDGED_M = 0.25
 
