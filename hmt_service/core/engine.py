@@ -364,7 +364,9 @@ class Engine:
         """Return what the latest keyframe says for a hypothesis, against the background."""
         visit, area = self._open, hypothesis.current.area
         if area == visit.visit:
-            return 0.0
+            if hypothesis.sees is None:
+                return 0.0
+            area = hypothesis.sees
         area_from_visit = inverse(hypothesis.graph.pose(area)) @ hypothesis.graph.pose(visit.visit)
         pose = area_from_visit @ visit.visit_from_keyframe[-1].mean
         known = self._visits[area].known_from(pose[:3, 3])

@@ -101,6 +101,8 @@ class Hypothesis:
     """The metric graph that follows from it; owned, solved on demand."""
     unlikely_for: int = 0
     """Number of areas entered since it was likely."""
+    sees: int | None = None
+    """Older area that the visit, to a new one, sees into."""
 
     @property
     def current(self) -> Assignment:
@@ -175,7 +177,8 @@ class Hypothesis:
         graph = self.graph.joined(Factor(area, visit, area_from_visit))
         if is_same_area:
             topology = topology.with_visit(Assignment(visit, area, area_from_visit))
-        return Hypothesis(hypothesis, log_weight, topology, graph, self.unlikely_for)
+        sees = None if is_same_area else area
+        return Hypothesis(hypothesis, log_weight, topology, graph, self.unlikely_for, sees)
 
     def without(self, visit: int) -> Hypothesis:
         """Return this hypothesis with what a visit says in the arcs of its area (section IV-D)."""

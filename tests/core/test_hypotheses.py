@@ -287,6 +287,12 @@ def test_recognised_visit_is_tied_and_may_keep_its_area(is_same_area: bool) -> N
     assert known.topology.areas == ((0, 1) if is_same_area else (0, 1, 3))
     assert known.graph.relative(1, 3).mean[0, 3] == pytest.approx(0.7, abs=0.01)
     assert new.graph.relative(1, 3).mean[0, 3] != pytest.approx(0.7, abs=0.05)
+    # What it goes on to see there is held against what it sees into, until it enters another area.
+    assert new.sees is None
+    assert known.sees == (None if is_same_area else 1)
+    onward = Factor(3, 4, gaussian(planar_pose(5.0, 0.0, 0.0)))
+    entered = known.extended(Assignment(4, 4, None), onward, hypothesis=5, log_weight=0.0)
+    assert entered.sees is None
     # Nobody need be told the same again.
     assert known.has_recognised(new, 1, place.mean)
     assert not new.has_recognised(new, 1, place.mean)
