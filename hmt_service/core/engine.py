@@ -65,7 +65,7 @@ from hmt_service.core.types import (
     Tracking,
 )
 from hmt_service.core.visits import Visits, share_new
-from hmt_service.errors import NotFound, Unavailable
+from hmt_service.errors import InvalidInput, NotFound, Unavailable
 
 
 class Engine:
@@ -117,9 +117,12 @@ class Engine:
             seed: Seed of all randomness from now on.
 
         Raises:
-            InvalidInput: If the settings in the map are not of this version.
+            InvalidInput: If the settings in the map are not of this version, or it is empty.
         """
         config = stored.config
+        if not stored.hypotheses or not stored.visits:
+            held = f"{len(stored.hypotheses)} hypotheses, {len(stored.visits)} visits"
+            raise InvalidInput(f"the map is empty: {held}")
         engine = cls(config, seed=seed)
         for keyframe in stored.keyframes:
             engine._observation.learn(keyframe)

@@ -15,6 +15,7 @@ from hmt_service.core.geometry import Pose, identity, inverse, log, planar_pose
 from hmt_service.core.graph import Factor, PoseGraph
 from hmt_service.core.odometry import Odometry
 from hmt_service.core.types import EventKind, MapMethod, TrackingFailure
+from hmt_service.errors import InvalidInput
 from tests.core.factories import RING, Walls, box, drive, gaussian, motion_covariance, ring_path
 from tests.mapped import mapped
 
@@ -65,6 +66,11 @@ def test_a_restored_map_is_the_map(name: str, ring: Engine) -> None:
     assert len(again.scans) == len(first.scans)
     assert again.config_json == first.config_json
     assert [len(h.factors) for h in again.hypotheses] == [len(h.factors) for h in first.hypotheses]
+
+
+def test_an_empty_map_is_nothing_to_go_on_with(ring: Engine) -> None:
+    with pytest.raises(InvalidInput, match="0 hypotheses, 3 visits"):
+        Engine.restored(replace(ring.stored(), hypotheses=()))
 
 
 def test_who_wakes_up_in_a_known_place_knows_soon_where(ring: Engine) -> None:
