@@ -101,9 +101,13 @@ class Transition:
         """
         candidates = self._candidates(hypothesis, visit, arc.visit_a, arc.a_from_b, visits)
         outside = self._mass_outside(candidates, visit, visits)
-        anywhere = self._anywhere(hypothesis, visit, arc.visit_a, arc.a_from_b, visits, outside)
-        if anywhere:
-            outside *= self._config.outside_share
+        # Who wakes up is in the map or outside; who has been outside goes on there.
+        share = self._config.outside_share
+        wakes_up = is_anywhere(arc.a_from_b)
+        odds = outside if wakes_up else outside / share
+        anywhere = self._anywhere(hypothesis, visit, arc.visit_a, arc.a_from_b, visits, odds)
+        if anywhere and wakes_up:
+            outside *= share
         new = Successor(None, None, 0.0, float(np.log(outside)))
         return (new, *self._matches(visit, [*candidates, *anywhere], visits))
 

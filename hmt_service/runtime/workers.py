@@ -78,8 +78,7 @@ def run_topology(
     _leave_signals_to_parent()
     topology = _Topology(config, seed, save, keeper)
     _send(work, Ready())
-    # What is written while nothing comes is told with the next answer.
-    for connection, message in _received(requests, work, idle=topology.keep):
+    for connection, message in _received(requests, work, idle=topology.rest):
         if connection is requests:
             _send(requests, topology.answer(message))
         elif isinstance(message, Finish):
@@ -101,6 +100,7 @@ class _Topology:
         self._stored_keyframes = self._keyframes
         self._kept_s = -math.inf
         self._pause_s = _KEEP_S
+        self._untold: tuple[Event, ...] = ()
         self._scans = 0
         self._odometry_busy_s = 0.0
         self._busy_s = 0.0
@@ -118,9 +118,14 @@ class _Topology:
         self._busy_s += time.perf_counter() - started
         self._scans += 1
         self._odometry_busy_s = tracked.busy_s
-        events = (*events, *self.keep())
+        events = (*events, *self._untold, *self.keep())
+        self._untold = ()
         has_changed = tracked.tracking.keyframe is not None or bool(events)
         return Mapped(self._engine.snapshot() if has_changed else None, events, self._report())
+
+    def rest(self) -> None:
+        """Write the map file while nothing comes; what went wrong is told with the next answer."""
+        self._untold = (*self._untold, *self.keep())
 
     def finish(self, finish: Finish) -> Mapped:
         """Complete the map and save it."""
@@ -165,12 +170,13 @@ class _Topology:
     def _write(self) -> tuple[str, ...]:
         """Write all results, and the map file."""
         files: tuple[str, ...] = ()
-        if self._save is not None:
-            files = self._save(self._engine, self._report())
+        # The map goes on in this file: nothing that fails with the others may keep it back.
         if self._keeper is not None and self._keyframes > 0:
             self._keeper.write(self._engine)
             self._stored_keyframes = self._keyframes
-            files = (*files, str(self._keeper.path))
+            files = (str(self._keeper.path),)
+        if self._save is not None:
+            files = (*files, *self._save(self._engine, self._report()))
         return files
 
     def keep(self) -> tuple[Event, ...]:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
+import sqlite3
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,12 +14,16 @@ import pytest
 from typer.testing import CliRunner
 
 from hmt_service.cli.app import app
+from hmt_service.cli.serve import NOT_SAVED
+from hmt_service.core.config import load_config
 from hmt_service.core.geometry import inverse
 from hmt_service.core.types import EventKind, TrackingFailure
+from hmt_service.errors import InvalidInput
 from hmt_service.io.map_check import check_map
 from hmt_service.io.map_file import read_map, write_map
 from hmt_service.runtime.messages import ProcessName
 from hmt_service.service.client import HmtClient
+from hmt_service.service.kept_map import KeptMap
 from tests.flat import path, readings
 from tests.mapped import map_file_in, mapped
 from tests.service.harness import running_daemon, wait_until
@@ -103,6 +109,19 @@ def test_a_map_file_that_cannot_be_written_is_an_event_and_keeps_what_it_held(
     assert known.read_bytes() == before
 
 
+def test_results_that_cannot_be_saved_do_not_keep_the_map_back(tmp_path: Path) -> None:
+    known, out = tmp_path / "known.hmt", tmp_path / "out"
+    out.write_text("a file where the folder should be")
+    with running_daemon(out, map_file=known) as daemon, daemon.client() as client:
+        publish(client, 0, 100)
+        wait_until(lambda: client.status().processed_scans == 100)
+        keyframes = client.status().keyframes
+        daemon.process.terminate()
+        assert "not saved" in daemon.output()
+    assert daemon.process.returncode == NOT_SAVED
+    assert len(read_map(known).keyframes) == keyframes
+
+
 @pytest.mark.parametrize("command", ["serve", "run"])
 def test_a_file_that_is_no_map_of_this_version_is_refused_and_left_alone(
     tmp_path: Path, command: str
@@ -116,6 +135,24 @@ def test_a_file_that_is_no_map_of_this_version_is_refused_and_left_alone(
     assert result.exception is not None
     assert "no map file or damaged" in str(result.exception)
     assert known.read_bytes() == damaged
+
+
+def test_damage_that_only_the_digest_shows_is_refused(tmp_path: Path) -> None:
+    known = map_file_in(tmp_path)
+    with closing(sqlite3.connect(known)) as database:
+        database.execute("UPDATE keyframes SET stamp_s = stamp_s + 1e-6 WHERE keyframe = 3")
+        database.commit()
+    with pytest.raises(InvalidInput, match="is damaged"):
+        KeptMap(known).engine(load_config(), seed=0)
+
+
+def test_a_link_to_a_map_stays_a_link(tmp_path: Path) -> None:
+    known, link = map_file_in(tmp_path), tmp_path / "link.hmt"
+    link.symlink_to(known)
+    before = known.stat().st_ino
+    KeptMap(link).write(mapped())
+    assert link.is_symlink()
+    assert known.stat().st_ino != before
 
 
 def test_settings_of_a_map_that_goes_on_are_its_own(tmp_path: Path) -> None:
