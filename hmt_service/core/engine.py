@@ -170,10 +170,9 @@ class Engine:
         Args:
             tracking: What the odometry says of one scan.
         """
-        known = self._open.last_keyframe + 1 if self._visits else 0
         # Before the first keyframe scans are relative to none.
-        is_next = tracking.keyframe is not None or known == self._first_of_session
-        return self._first_of_session + tracking.keyframe_index >= known + is_next
+        is_next = tracking.keyframe is not None or self.keyframes == self._first_of_session
+        return self._first_of_session + tracking.keyframe_index >= self.keyframes + is_next
 
     def _of_session(self, tracking: Tracking) -> Tracking:
         """Number the keyframes of a new session after those of the map that it goes on with."""
@@ -428,6 +427,11 @@ class Engine:
     # ------------------------------------------------------------------ what readers may ask
 
     @property
+    def keyframes(self) -> int:
+        """Number of keyframes in the map."""
+        return self._open.last_keyframe + 1 if self._visits else 0
+
+    @property
     def audit(self) -> Audit:
         """What was decided and believed."""
         return self._audit
@@ -468,7 +472,7 @@ class Engine:
             reference_area=0,
             areas=len(best.topology.areas),
             arcs=best.topology.arcs,
-            keyframes=visit.last_keyframe + 1,
+            keyframes=self.keyframes,
         )
 
     def global_map(

@@ -351,20 +351,22 @@ class PoseGraph:
         there, whose steps are small.
         """
         part = self.part_of(factor.visit_b)
-        graph = self.copy()
-        if factor.visit_a not in part:
-            if next(iter(self._visits)) in part:
-                return self.joined(
-                    Factor(factor.visit_b, factor.visit_a, factor.a_from_b.inverse())
-                )
+        if factor.visit_a in part:
+            graph = self.copy()
+        elif next(iter(self._visits)) in part:
+            return self.joined(factor.reversed)
+        else:
             there = self.pose(factor.visit_a) @ factor.a_from_b.mean
-            moved = there @ inverse(self.pose(factor.visit_b))
-            poses = {v: moved @ self.pose(v) if v in part else self.pose(v) for v in self._visits}
-            anchors = {visit: anchor for visit, (anchor, _) in self._held.items()}
-            is_planar = self._space is _PLANAR
-            graph = PoseGraph.restored(poses, self.factors, anchors, is_planar=is_planar)
+            graph = self._moved(part, there @ inverse(self.pose(factor.visit_b)))
         graph.fuse_factor(factor)
         return graph
+
+    def _moved(self, part: frozenset[int], moved: Pose) -> PoseGraph:
+        """Return a graph of the same arcs in which one part lies elsewhere."""
+        poses = {v: moved @ self.pose(v) if v in part else self.pose(v) for v in self._visits}
+        anchors = {visit: anchor for visit, (anchor, _) in self._held.items()}
+        is_planar = self._space is _PLANAR
+        return PoseGraph.restored(poses, self.factors, anchors, is_planar=is_planar)
 
     def copy(self) -> PoseGraph:
         """Return an independent graph that shares factors and solution until one changes."""

@@ -142,16 +142,12 @@ class Hypothesis:
             hypothesis: Identifier of the successor.
             log_weight: Its log weight, not normalised.
         """
-        graph, place = self.graph.copy(), assignment.area_from_visit
-        if place is None:
-            graph.add_factor(arc)
-        else:
-            # The first arc places the visit: its motion may say nothing.
-            first, second = Factor(assignment.area, assignment.visit, place), arc
-            if not is_anywhere(arc.a_from_b):
-                first, second = second, first
-            graph.add_factor(first)
-            graph.fuse_factor(second)
+        graph, place, arcs = self.graph.copy(), assignment.area_from_visit, [arc]
+        if place is not None:
+            arcs.append(Factor(assignment.area, assignment.visit, place))
+        # The first arc places the visit: a motion that says nothing comes last.
+        for each in sorted(arcs, key=lambda factor: is_anywhere(factor.a_from_b)):
+            graph.fuse_factor(each)
         topology = self.topology.with_visit(assignment)
         return Hypothesis(hypothesis, log_weight, topology, graph, self.unlikely_for)
 

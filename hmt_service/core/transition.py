@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -47,6 +48,29 @@ class Successor:
     """Share of what the visit saw that the area explains, in [0, 1]; 0 for a new one."""
     log_factor: float
     """Log of the probability of entering here times that of the observations, up to a constant."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Question:
+    """Where is a visit of which a motion is known?"""
+
+    hypothesis: Hypothesis
+    """What is believed of everything before."""
+    visit: Visit
+    known: int
+    """The visit that the motion is from."""
+    known_from_visit: GaussianPose
+    visits: Visits
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the motion says nothing."""
+        return is_anywhere(self.known_from_visit)
+
+    @cached_property
+    def part(self) -> frozenset[int]:
+        """Visits whose place beside the visit follows from the motion."""
+        return frozenset() if self.is_open else self.hypothesis.graph.part_of(self.known)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -99,17 +123,14 @@ class Transition:
         Returns:
             A new area first, then each mode of each known area.
         """
-        candidates = self._candidates(hypothesis, visit, arc.visit_a, arc.a_from_b, visits)
+        where = _Question(hypothesis, visit, arc.visit_a, arc.a_from_b, visits)
+        candidates = self._candidates(where)
         outside = self._mass_outside(candidates, visit, visits)
         # Who wakes up is in the map or outside; who has been outside goes on there.
-        share = self._config.outside_share
-        wakes_up = is_anywhere(arc.a_from_b)
-        odds = outside if wakes_up else outside / share
-        anywhere = self._anywhere(hypothesis, visit, arc.visit_a, arc.a_from_b, visits, odds)
-        if anywhere and wakes_up:
-            outside *= share
-        new = Successor(None, None, 0.0, float(np.log(outside)))
-        return (new, *self._matches(visit, [*candidates, *anywhere], visits))
+        new = outside * self._config.outside_share if where.is_open else outside
+        candidates += self._anywhere(where, new)
+        successor = Successor(None, None, 0.0, float(np.log(new)))
+        return (successor, *self._matches(visit, candidates, visits))
 
     def recognitions(
         self, hypothesis: Hypothesis, visit: Visit, visits: Visits
@@ -126,20 +147,11 @@ class Transition:
         """
         if hypothesis.current.area_from_visit is not None:
             return ()
-        here = certain(identity())
+        where = _Question(hypothesis, visit, visit.visit, certain(identity()), visits)
         candidates = self._candidates(
-            hypothesis,
-            visit,
-            visit.visit,
-            here,
-            visits,
-            is_asked=lambda prior: not is_certain(prior, self._refinement),
+            where, is_asked=lambda prior: not is_certain(prior, self._refinement)
         )
-        # As a new area it was outside all that is known: of that much less was expected.
-        anywhere = self._anywhere(
-            hypothesis, visit, visit.visit, here, visits, 1.0 / self._config.outside_share
-        )
-        return self._matches(visit, [*candidates, *anywhere], visits)
+        return self._matches(visit, [*candidates, *self._anywhere(where, 1.0)], visits)
 
     def _matches(
         self,
@@ -163,29 +175,22 @@ class Transition:
         )
 
     def _candidates(
-        self,
-        hypothesis: Hypothesis,
-        visit: Visit,
-        known: int,
-        known_from_visit: GaussianPose,
-        visits: Visits,
-        *,
-        is_asked: Callable[[GaussianPose], bool] = lambda _: True,
+        self, where: _Question, *, is_asked: Callable[[GaussianPose], bool] = lambda _: True
     ) -> list[_Candidate]:
         """Return the areas whose extent the prior reaches, the nearest first."""
+        hypothesis, known, known_from_visit = where.hypothesis, where.known, where.known_from_visit
         most, graph = self._config.max_candidates, hypothesis.graph
         # The visit before ended where its own content does. An older area may go on beyond that,
         # and who does not know how he went may not have left at all.
         is_known = is_certain(known_from_visit, self._refinement)
         left = known if is_known and hypothesis.current.area == known else None
-        part = frozenset[int]() if is_anywhere(known_from_visit) else graph.part_of(known)
-        areas = np.array([a for a in hypothesis.topology.areas if a != left and a in part])
+        areas = np.array([a for a in hypothesis.topology.areas if a != left and a in where.part])
         if not len(areas):
             return []
-        extents = visits.extents(visit.visit)[areas]
+        extents = where.visits.extents(where.visit.visit)[areas]
         here = graph.pose(known) @ known_from_visit.mean
         margins = self._config.margin_share * extents[:, 4]
-        distances = gaps_m(visit, here, graph.poses()[areas], extents) - margins
+        distances = gaps_m(where.visit, here, graph.poses()[areas], extents) - margins
         result = []
         # How well a place is known is asked of the nearest only: it costs more than all else here.
         for index in np.argsort(distances, kind="stable")[: _ASKED * most]:
@@ -197,39 +202,24 @@ class Transition:
                     break
         return result
 
-    def _anywhere(
-        self,
-        hypothesis: Hypothesis,
-        visit: Visit,
-        known: int,
-        known_from_visit: GaussianPose,
-        visits: Visits,
-        mass: float,
-    ) -> list[_Candidate]:
+    def _anywhere(self, where: _Question, outside: float) -> list[_Candidate]:
         """Return the areas that the visit may be to because nobody knows where those are.
 
         A robot that wakes up is as likely beside one keyframe of the map as beside another, and may
         be outside of all.
 
         Args:
-            hypothesis: What is believed.
-            visit: The visit.
-            known: A visit that it has a motion from.
-            known_from_visit: That motion.
-            visits: All visits.
-            mass: Probability that it is in none of the areas whose place is known.
+            where: What is asked.
+            outside: Probability that it is in no area at all.
         """
-        graph = hypothesis.graph
-        if graph.is_whole and not is_anywhere(known_from_visit):
-            return []
-        part = frozenset[int]() if is_anywhere(known_from_visit) else graph.part_of(known)
-        areas = [area for area in hypothesis.topology.areas if area not in part]
+        visits, share = where.visits, self._config.outside_share
+        areas = [area for area in where.hypothesis.topology.areas if area not in where.part]
         keyframes = sum(visits.keyframes(area) for area in areas)
-        inside = (1.0 - self._config.outside_share) * mass
+        inside = outside * (1.0 - share) / share
         return [
             _Candidate(
                 area,
-                anywhere_in(visits[area], visit, self._config.presence_m),
+                anywhere_in(visits[area], where.visit, self._config.presence_m),
                 inside * visits.keyframes(area) / keyframes,
             )
             for area in areas

@@ -132,27 +132,19 @@ def read_map(path: Path, *, with_points: bool = True) -> StoredMap:
 
     Args:
         path: Map file.
-        with_points: Whether keyframes come with what they saw, which is most of the file.
+        with_points: Whether keyframes come with what they saw, which is most of the file. Only then
+            the whole content is compared with its digest.
 
     Raises:
         NotFound: If there is no such file.
         InvalidInput: If it is no map file, is damaged or was written by another version.
     """
     with opened(path) as database:
+        if with_points:
+            known, found = dict(_rows(database, "meta")).get(DIGEST), content_digest(database)
+            if known is not None and known != found:
+                raise InvalidInput(f"{path} is damaged: it has digest {found[:12]}…, not {known}")
         return _read(database, with_points=with_points)
-
-
-def verify(path: Path) -> None:
-    """Compare the content of a map file with its digest, if it has one.
-
-    Raises:
-        NotFound: If there is no such file.
-        InvalidInput: If they differ, or it is no map file or was written by another version.
-    """
-    with opened(path) as database:
-        known, digest = dict(_rows(database, "meta")).get(DIGEST), content_digest(database)
-    if known is not None and known != digest:
-        raise InvalidInput(f"{path} is damaged: its content has digest {digest[:12]}…, not {known}")
 
 
 def read_config(path: Path) -> Config:

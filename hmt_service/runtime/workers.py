@@ -93,11 +93,12 @@ class _Topology:
     def __init__(self, config: Config, seed: int, save: Save | None, keeper: Keeper | None) -> None:
         from hmt_service.core.engine import Engine
 
-        restored = None if keeper is None else keeper.engine(config, seed=seed)
-        self._engine = restored or Engine(config, seed=seed)
+        self._engine = (
+            Engine(config, seed=seed) if keeper is None else keeper.engine(config, seed=seed)
+        )
         self._save = save
         self._keeper = keeper
-        self._stored_keyframes = self._keyframes
+        self._stored_keyframes = self._engine.keyframes
         self._kept_s = -math.inf
         self._pause_s = _KEEP_S
         self._untold: tuple[Event, ...] = ()
@@ -171,9 +172,9 @@ class _Topology:
         """Write all results, and the map file."""
         files: tuple[str, ...] = ()
         # The map goes on in this file: nothing that fails with the others may keep it back.
-        if self._keeper is not None and self._keyframes > 0:
+        if self._keeper is not None and self._engine.keyframes > 0:
             self._keeper.write(self._engine)
-            self._stored_keyframes = self._keyframes
+            self._stored_keyframes = self._engine.keyframes
             files = (str(self._keeper.path),)
         if self._save is not None:
             files = (*files, *self._save(self._engine, self._report()))
@@ -182,7 +183,7 @@ class _Topology:
     def keep(self) -> tuple[Event, ...]:
         """Write the map file if it lacks keyframes, but not all the time; say what went wrong."""
         keeper, started_s = self._keeper, time.monotonic()
-        if keeper is None or self._keyframes == self._stored_keyframes:
+        if keeper is None or self._engine.keyframes == self._stored_keyframes:
             return ()
         if started_s - self._kept_s < self._pause_s:
             return ()
@@ -190,17 +191,13 @@ class _Topology:
         self._kept_s = time.monotonic()
         self._pause_s = max(_KEEP_S, (self._kept_s - started_s) / _KEEP_SHARE)
         if failed is None:
-            self._stored_keyframes = self._keyframes
+            self._stored_keyframes = self._engine.keyframes
             return ()
-        numbers = {"keyframes": float(self._keyframes), "stored": float(self._stored_keyframes)}
+        keyframes, stored = float(self._engine.keyframes), float(self._stored_keyframes)
+        numbers = {"keyframes": keyframes, "stored": stored}
         snapshot = self._engine.snapshot()
         stamp_s = 0.0 if snapshot is None else snapshot.posterior.stamp_s
         return (Event(EventKind.NOT_SAVED, stamp_s, str(failed), numbers),)
-
-    @property
-    def _keyframes(self) -> int:
-        snapshot = self._engine.snapshot()
-        return 0 if snapshot is None else snapshot.keyframes
 
     def _report(self) -> RunReport:
         return RunReport(self._scans, self._odometry_busy_s, self._busy_s, self._stored_keyframes)

@@ -34,12 +34,10 @@ class KeptMap:
             InvalidInput: If the file is no map file, is damaged or was written by another version.
         """
         from hmt_service.core.engine import Engine
-        from hmt_service.io.map_file import read_map, verify
+        from hmt_service.io.map_file import read_map
 
         if not self.path.exists():
             return Engine(config, seed=seed)
-        # What is damaged now would be written again as sound.
-        verify(self.path)
         return Engine.restored(read_map(self.path), seed=seed)
 
     def write(self, engine: Engine) -> None:

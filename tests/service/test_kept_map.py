@@ -36,6 +36,10 @@ def publish(client: HmtClient, first: int, last: int, *, later_s: float = 0.0) -
         client.publish(replace(reading, stamp_s=reading.stamp_s + later_s))
 
 
+def wait_for(client: HmtClient, count: str, least: int) -> None:
+    wait_until(lambda: getattr(client.status(), count) >= least)
+
+
 @pytest.mark.parametrize("victim", [ProcessName.TOPOLOGY, ProcessName.ODOMETRY, None])
 def test_what_is_stored_survives_a_kill_at_any_moment(
     tmp_path: Path, victim: ProcessName | None
@@ -49,10 +53,9 @@ def test_what_is_stored_survives_a_kill_at_any_moment(
             daemon.client() as client,
         ):
             publish(client, 0, 100, later_s=1e4 * kill)
-            wait_until(lambda c=client, s=stored: c.status().stored_keyframes > s)  # type: ignore[misc]
+            wait_for(client, "stored_keyframes", stored + 1)
             publish(client, 100, 300, later_s=1e4 * kill)
-            moment = rng.integers(0, 200)
-            wait_until(lambda c=client, m=moment: c.status().processed_scans > 100 + m)  # type: ignore[misc]
+            wait_for(client, "processed_scans", 101 + int(rng.integers(0, 200)))
             status = client.status()
             stored = status.stored_keyframes
             processes = {process.name: process.pid for process in status.processes}

@@ -10,8 +10,9 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -22,9 +23,12 @@ from hmt_service.errors import InvalidInput
 from hmt_service.io.placed_map import PlacedMap
 from hmt_service.io.whole_files import whole_files
 
-# Ours are [rotation, translation]; theirs are x, y, yaw, or x, y, z and the rotation.
-_PLANAR_AXES = np.array([3, 4, 2])
-_SPATIAL_AXES = np.array([3, 4, 5, 0, 1, 2])
+
+class _Form(NamedTuple):
+    name: str
+    axes: npt.NDArray[np.intp]
+    """Rows of our tangent `[rotation, translation]`, in the order of theirs."""
+    pose: Callable[[Pose], list[float]]
 
 
 def export_g2o(placed: PlacedMap, path: Path) -> None:
@@ -33,27 +37,19 @@ def export_g2o(placed: PlacedMap, path: Path) -> None:
     Raises:
         InvalidInput: If a covariance has no inverse.
     """
-    lines = _planar(placed) if placed.config.sensor.is_planar else _spatial(placed)
+    form = _PLANAR if placed.config.sensor.is_planar else _SPATIAL
     with whole_files(path) as (part,):
-        part.write_text("".join(f"{line}\n" for line in lines))
+        part.write_text("".join(f"{line}\n" for line in _lines(placed, form)))
 
 
-def _planar(placed: PlacedMap) -> Iterator[str]:
+def _lines(placed: PlacedMap, form: _Form) -> Iterator[str]:
     for visit in _tied(placed):
-        yield f"VERTEX_SE2 {visit} {_numbers(_pose2(placed.reference_from_visit[visit]))}"
+        pose = form.pose(placed.reference_from_visit[visit])
+        yield f"VERTEX_{form.name} {visit} {_numbers(pose)}"
     for factor in placed.hypothesis.factors:
-        information = _information(factor, _PLANAR_AXES)
-        values = [*_pose2(factor.a_from_b.mean), *information[np.triu_indices(3)]]
-        yield f"EDGE_SE2 {factor.visit_a} {factor.visit_b} {_numbers(values)}"
-
-
-def _spatial(placed: PlacedMap) -> Iterator[str]:
-    for visit in _tied(placed):
-        yield f"VERTEX_SE3:QUAT {visit} {_numbers(_pose3(placed.reference_from_visit[visit]))}"
-    for factor in placed.hypothesis.factors:
-        information = _information(factor, _SPATIAL_AXES)
-        values = [*_pose3(factor.a_from_b.mean), *information[np.triu_indices(6)]]
-        yield f"EDGE_SE3:QUAT {factor.visit_a} {factor.visit_b} {_numbers(values)}"
+        information = _information(factor, form.axes)
+        values = [*form.pose(factor.a_from_b.mean), *information[np.triu_indices(len(form.axes))]]
+        yield f"EDGE_{form.name} {factor.visit_a} {factor.visit_b} {_numbers(values)}"
 
 
 def _tied(placed: PlacedMap) -> list[int]:
@@ -84,3 +80,7 @@ def _pose3(pose: Pose) -> list[float]:
 def _numbers(values: Iterable[float]) -> str:
     """Return numbers with as many digits as bring them back bit for bit."""
     return " ".join(repr(float(value)) for value in values)
+
+
+_PLANAR = _Form("SE2", np.array([3, 4, 2]), _pose2)
+_SPATIAL = _Form("SE3:QUAT", np.array([3, 4, 5, 0, 1, 2]), _pose3)
