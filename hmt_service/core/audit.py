@@ -170,7 +170,7 @@ def recognised(visit: int, best: Hypothesis, stamp_s: float) -> Event:
     """Return that a visit to a new area, as all of it shows, was to a known one."""
     area = best.topology.assignments[visit].area
     numbers = {"hypothesis": float(best.hypothesis), "visit": float(visit), "area": float(area)}
-    message = f"area {visit} is area {area}: that explains what was seen"
+    message = f"area {visit} is area {area}: what was seen is known"
     return Event(EventKind.ACCEPTED, stamp_s, message, numbers)
 
 

@@ -2,7 +2,7 @@
 
 Where a visit is, is not decided here: a pair of visits is tied only where the hypothesis' own graph
 already says, with little doubt, that they have seen the same space. Only then a visit to a new area
-may turn out to be one to a known area, which explains what the rest of the visit has seen.
+may turn out to be one to a known area: where such areas explain what all of the visit has seen.
 
 References:
     Blanco et al. 2008, section V (local maps are fused once the topology is settled).
@@ -18,7 +18,7 @@ from hmt_service.core.geometry import GaussianPose
 from hmt_service.core.graph import Factor
 from hmt_service.core.hypotheses import SAME_AREA, Assignment, Hypothesis
 from hmt_service.core.submap import Visit
-from hmt_service.core.visits import Visits, gaps_m
+from hmt_service.core.visits import Visits, gaps_m, share_new
 
 # chi-square 99.9 % for 6 degrees of freedom: a match beyond it contradicts the graph.
 _GATE = 22.46
@@ -74,8 +74,10 @@ class Refinement:
             if other == founder:
                 assignment = replace(assignment, area_from_visit=mode.target_from_visit)
         if founder == visit.visit:
-            area, mode = max(ties, key=lambda tie: tie[1].overlap)
-            if mode.overlap >= SAME_AREA:
+            # Who goes along the border of two areas is in neither for the most part, and in no new.
+            new = share_new(visit, [visits[other] for other, _ in ties], graph.poses())
+            if new <= 1.0 - SAME_AREA:
+                area, mode = max(ties, key=lambda tie: tie[1].overlap)
                 assignment = Assignment(visit.visit, area, mode.target_from_visit)
         topology = hypothesis.topology.with_visit(assignment)
         return replace(hypothesis, graph=graph, topology=topology)

@@ -12,7 +12,7 @@ from hmt_service.core.graph import Factor, PoseGraph
 from hmt_service.core.hypotheses import Assignment, Hypothesis, Topology
 from hmt_service.core.refinement import Refinement
 from hmt_service.core.submap import Visit
-from hmt_service.core.visits import Visits
+from hmt_service.core.visits import Visits, share_new
 from tests.core.factories import ROOM, SQUARE, box, gaussian, line, visit_along
 
 FAR = np.concatenate([box(40.0, -2.0, 48.0, 2.0), box(42.0, -1.0, 43.0, 1.0)])
@@ -112,6 +112,39 @@ def test_visit_that_sees_into_an_area_was_not_to_it() -> None:
     assert is_tied(result, 0, 2)
     assert result.topology.path == (0, 1, 2)
     assert result.topology.assignments[2].area_from_visit is None
+
+
+def test_visit_on_the_border_of_two_areas_is_not_to_a_third() -> None:
+    # Each half has seen its walls only; who stands between them sees both.
+    pillars = np.concatenate([box(-3.0, 0.8, -2.4, 1.5), box(2.0, -1.6, 2.8, -1.2)])
+    left, right = np.array([-4.0, -2.0, 0.0, 2.0]), np.array([0.0, -2.0, 4.0, 2.0])
+    halves = [
+        np.concatenate([walls[np.abs(walls[:, [0, 2]]).max(axis=1) > 0.0], pillars[of]])
+        for walls, of in ((box(*left), slice(4)), (box(*right), slice(4, 8)))
+    ]
+    both = np.concatenate([box(-4.0, -2.0, 4.0, 2.0), pillars])
+    starts = [planar_pose(x, 0.0, 0.0) for x in (-2.5, 1.0, 44.0, -0.75)]
+    worlds = [*halves, WORLD, both]
+    visits = Visits(
+        visit_along(world, line(start, length_m=1.5), visit=i)
+        for i, (world, start) in enumerate(zip(worlds, starts, strict=True))
+    )
+    graph = PoseGraph(is_planar=True)
+    graph.add_reference(0)
+    for a in range(3):
+        motion = gaussian(inverse(starts[a]) @ starts[a + 1], sigma_rad=0.002)
+        graph.add_factor(Factor(a, a + 1, motion))
+    all_new = Topology(tuple(Assignment(i, i, None) for i in range(4)))
+    config = load_config()
+    result = Refinement(config, Aligner(config)).refine(
+        Hypothesis(0, 0.0, all_new, graph), visits[3], visits
+    )
+    assert is_tied(result, 0, 3)
+    assert is_tied(result, 1, 3)
+    assert result.topology.areas == (0, 1, 2)
+    # Neither alone explains enough.
+    for known in (0, 1):
+        assert share_new(visits[3], [visits[known]], result.graph.poses()) > 0.4
 
 
 def test_alignment_with_its_own_area_is_replaced_by_the_better_one() -> None:
