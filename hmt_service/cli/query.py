@@ -22,7 +22,7 @@ from hmt_service.service.keys import DEFAULT_ENDPOINT
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from hmt_service.core.types import Belief, GlobalMap
+    from hmt_service.core.types import Belief, GlobalMap, Localization
     from hmt_service.service.client import HmtClient
     from hmt_service.service.reports import Status
 
@@ -67,6 +67,7 @@ def pose(
     rows = {
         "stamp": f"{answer.stamp_s:.3f} s",
         "area": f"{answer.area}, probability {answer.probability:.3f}",
+        "localised": _localised(answer.localization, answer.stamp_s),
         "pose in the area": _pose(answer.area_from_body),
         f"pose in the frame of area {answer.reference_area}": _pose(answer.reference_from_body),
         "hypothesis": f"{answer.hypothesis}, revision {answer.revision}",
@@ -338,6 +339,8 @@ def _status_rows(answer: Status) -> dict[str, str]:
         f"{answer.keyframes} keyframes, {answer.hypotheses} hypotheses",
         "stored": f"{answer.stored_keyframes} keyframes in the map file",
     }
+    if answer.localization is not None:
+        rows["localised"] = _localised(answer.localization, answer.localization.stamp_s)
     for process in answer.processes:
         readiness = "ready" if process.is_ready else "loading"
         rows[process.name] = (
@@ -345,6 +348,17 @@ def _status_rows(answer: Status) -> dict[str, str]:
             f"{process.busy_s:.1f} s, {process.backlog} waiting"
         )
     return rows
+
+
+def _localised(localization: Localization, stamp_s: float) -> str:
+    evidence = "the robot has not come back to a known place"
+    if localization.evidence_stamp_s is not None:
+        age_s = max(0.0, stamp_s - localization.evidence_stamp_s)
+        evidence = f"last at a known place {age_s:.1f} s ago"
+    return (
+        f"probability {localization.probability:.3f}, entropy {localization.entropy_nat:.2f} nat, "
+        f"{evidence}"
+    )
 
 
 def _areas_table(answer: GlobalMap) -> Table:

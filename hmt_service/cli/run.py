@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hmt_service.cli.recorded import print_contents, print_malformed
-from hmt_service.cli.settings import ConfigFile, OwnPreset, Seed, settings_of_map
+from hmt_service.cli.settings import ConfigFile, Frozen, OwnPreset, Seed, kept_map, settings_of_map
 from hmt_service.errors import NotFound
 
 if TYPE_CHECKING:
@@ -37,17 +37,18 @@ def run(
             "--map", help="Map file to go on with, from an unknown place; it is not changed."
         ),
     ] = None,
+    frozen: Frozen = False,
 ) -> None:
     """Build the map of a recorded log; the same log and seed give the same files, bit for bit."""
     from rich.console import Console
 
     from hmt_service.io.logs import read_log
-    from hmt_service.service.kept_map import KeptMap
     from hmt_service.service.results import save_results
 
     console = Console(stderr=True)
     if map_file is not None and not map_file.is_file():
         raise NotFound(f"map file {map_file} does not exist")
+    kept = kept_map(map_file, is_frozen=frozen)
     settings = settings_of_map(map_file, preset, config)
     with console.status(f"reading {log}"):
         recorded = read_log(
@@ -56,7 +57,7 @@ def run(
             max_range_m=settings.sensor.max_range_m,
         )
     print_contents(console, recorded)
-    known = None if map_file is None else KeptMap(map_file).engine(settings, seed=seed)
+    known = None if kept is None else kept.engine(settings, seed=seed)
     engine, report = _map(recorded.readings, recorded.scans, settings, seed, known, console)
     print_malformed(console, recorded)
     files = save_results(engine, report, directory=out, config=settings, seed=seed)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hmt_service.cli.connection import Robot, Site
-from hmt_service.cli.settings import ConfigFile, OwnPreset, Seed, settings_of_map
+from hmt_service.cli.settings import ConfigFile, Frozen, OwnPreset, Seed, kept_map, settings_of_map
 from hmt_service.errors import NotFound
 from hmt_service.service.keys import DEFAULT_ENDPOINT, Keys
 
@@ -65,6 +65,7 @@ def serve(
             "written as the map grows: what `status` calls stored survives anything.",
         ),
     ] = None,
+    frozen: Frozen = False,
 ) -> None:
     """Build the map of one robot from what it sends, and answer questions about it.
 
@@ -76,13 +77,13 @@ def serve(
 
     from hmt_service.service.daemon import Daemon, DaemonSettings
     from hmt_service.service.intake import IntakeLimits
-    from hmt_service.service.kept_map import KeptMap
     from hmt_service.service.results import save_results
     from hmt_service.service.session import Endpoints, Mode
 
     console = Console(stderr=True)
     handler = RichHandler(console=console, show_path=False)
     logging.basicConfig(level=logging.INFO, format="%(message)s", handlers=[handler])
+    kept = kept_map(map_file, is_frozen=frozen)
     settings = settings_of_map(map_file, preset, config)
     if map_file is not None and not map_file.absolute().parent.is_dir():
         raise NotFound(f"folder {map_file.absolute().parent} of the map file does not exist")
@@ -104,7 +105,7 @@ def serve(
             config=settings,
             seed=seed,
             save=save,
-            keeper=None if map_file is None else KeptMap(map_file),
+            keeper=kept,
             limits=IntakeLimits(reorder_s=reorder_window),
         )
     )
@@ -113,7 +114,7 @@ def serve(
             on_open=lambda: console.print(f"serving site {site}, robot {robot} {endpoints}")
         )
     _print(console, report)
-    is_saving = save is not None or map_file is not None
+    is_saving = save is not None or (map_file is not None and not frozen)
     raise typer.Exit(_exit_code(report, is_saving=is_saving))
 
 

@@ -6,12 +6,15 @@ References: own.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from hmt_service.core.config import Config, Preset, load_config
 from hmt_service.errors import InvalidInput, NotFound
+
+if TYPE_CHECKING:
+    from hmt_service.service.kept_map import KeptMap
 
 PresetName = Annotated[Preset, typer.Option("--preset", help="Kind of sensor.")]
 OwnPreset = Annotated[
@@ -21,6 +24,12 @@ OwnPreset = Annotated[
 ConfigFile = Annotated[
     Path | None,
     typer.Option("--config", help="YAML file of settings that differ from the preset."),
+]
+Frozen = Annotated[
+    bool,
+    typer.Option(
+        "--frozen", help="Find the robot's place in the map of --map and leave it as it is."
+    ),
 ]
 Seed = Annotated[int, typer.Option("--seed", min=0, help="Seed of all randomness.")]
 
@@ -40,6 +49,24 @@ def settings_of_map(map_file: Path | None, preset: Preset | None, config: Path |
     from hmt_service.io.map_file import read_config
 
     return read_config(map_file)
+
+
+def kept_map(map_file: Path | None, *, is_frozen: bool) -> KeptMap | None:
+    """Return the map that goes on, if one is named.
+
+    Raises:
+        InvalidInput: If there is nothing that could be frozen.
+        NotFound: If a map that is frozen does not exist.
+    """
+    from hmt_service.service.kept_map import KeptMap
+
+    if map_file is None:
+        if is_frozen:
+            raise InvalidInput("--frozen needs the map that --map names")
+        return None
+    if is_frozen and not map_file.is_file():
+        raise NotFound(f"map file {map_file} does not exist")
+    return KeptMap(map_file, is_frozen)
 
 
 def load_settings(preset: Preset, config: Path | None) -> Config:

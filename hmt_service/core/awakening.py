@@ -2,7 +2,8 @@
 
 A new session begins like a visit to an area after a motion of which nothing is known. That motion
 is an arc, so that the graph stays one; but what it joins are two parts that have no place beside
-each other until an alignment ties them.
+each other until an alignment ties them. A robot that is carried away while it runs wakes up where
+it is put down.
 
 References:
     Blanco et al. 2008, section II (the awakening problem is one of topological inference).
@@ -42,9 +43,21 @@ def awakened(keyframe: Keyframe, *, is_planar: bool) -> Keyframe:
         keyframe: As an odometry gives it that knows nothing of a session before.
         is_planar: Whether poses are planar.
     """
+    return replace(
+        keyframe,
+        failure=TrackingFailure.NEW_SESSION,
+        previous_from_body=anywhere(is_planar=is_planar),
+    )
+
+
+def anywhere(*, is_planar: bool) -> GaussianPose:
+    """Return a relative pose of which nothing is known.
+
+    Args:
+        is_planar: Whether poses are planar.
+    """
     covariance = isotropic_covariance(sigma_rad=ANY_HEADING_RAD, sigma_m=_ANYWHERE_M)
-    anywhere = GaussianPose(identity(), confined(covariance, is_planar=is_planar))
-    return replace(keyframe, failure=TrackingFailure.NEW_SESSION, previous_from_body=anywhere)
+    return GaussianPose(identity(), confined(covariance, is_planar=is_planar))
 
 
 def is_anywhere(pose: GaussianPose) -> bool:

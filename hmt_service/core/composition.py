@@ -50,8 +50,8 @@ def arcs_of(hypothesis: Hypothesis, motions: Sequence[Factor]) -> tuple[Arc, ...
         end = hypothesis.topology.assignments[motion.visit_b]
         if start.area == end.area:
             continue
-        if is_anywhere(motion.a_from_b):
-            # What ties a session to those before is no motion, but all that has been recognised.
+        if end.is_carried or is_anywhere(motion.a_from_b):
+            # What ties what follows to what was before is no motion, but what was recognised.
             a_from_b = hypothesis.graph.relative(start.area, end.area)
         else:
             a_from_b = _aligned(start.area_from_visit) @ motion.a_from_b

@@ -104,9 +104,10 @@ class Engine:
         self._finished_revision = 0
         self._smoothed: tuple[int, FloatArray] | None = None
         self._first_of_session = 0
+        self._frozen_visits = 0
 
     @classmethod
-    def restored(cls, stored: StoredMap, *, seed: int = 0) -> Engine:
+    def restored(cls, stored: StoredMap, *, seed: int = 0, is_frozen: bool = False) -> Engine:
         """Return an engine that goes on with a stored map, in a new session.
 
         The next tracking is the first of an odometry that knows nothing of the map: the robot may
@@ -115,11 +116,13 @@ class Engine:
         Args:
             stored: The map, with at least one keyframe.
             seed: Seed of all randomness from now on.
+            is_frozen: Whether the areas stay where and what they are: the session only finds its
+                place in them, and of its visits there only the path is kept.
 
         Raises:
             InvalidInput: If the settings in the map are not of this version, or it is empty.
         """
-        config = stored.config
+        config = _frozen(stored.config) if is_frozen else stored.config
         if not stored.hypotheses or not stored.visits:
             held = f"{len(stored.hypotheses)} hypotheses, {len(stored.visits)} visits"
             raise InvalidInput(f"the map is empty: {held}")
@@ -134,11 +137,15 @@ class Engine:
         ]
         is_planar = config.sensor.is_planar
         engine._particles.replace(
-            [restored_hypothesis(h, is_planar=is_planar) for h in stored.hypotheses]
+            [
+                restored_hypothesis(h, is_planar=is_planar, is_frozen=is_frozen)
+                for h in stored.hypotheses
+            ]
         )
         engine._next_hypothesis = 1 + max(h.hypothesis for h in stored.hypotheses)
         engine._revision = engine._finished_revision = stored.revision
         engine._first_of_session = len(stored.keyframes)
+        engine._frozen_visits = len(visits) if is_frozen else 0
         return engine
 
     # ------------------------------------------------------------------ from scans to hypotheses
@@ -239,7 +246,7 @@ class Engine:
     def finish(self, *, is_urgent: bool = False) -> tuple[Event, ...]:
         """Refine what the last visit says, and smooth the trajectory of the best hypothesis.
 
-        More trackings may follow, and twice is as good as once.
+        A frozen map keeps its own. More trackings may follow, and twice is as good as once.
 
         Args:
             is_urgent: Whether there is no time to look for the last visit elsewhere, and to smooth.
@@ -252,7 +259,7 @@ class Engine:
             refined = self._audited(self._refine(self._open, self._open.keyframes[-1].stamp_s))
             self._revision += 1
             self._finished_revision = self._revision
-        if is_urgent or not self._visits or self._smooth_poses() is not None:
+        if is_urgent or self.is_frozen or not self._visits or self._smooth_poses() is not None:
             return refined
         recognised = self._audited(self._recognise(self._open, self._open.keyframes[-1].stamp_s))
         if recognised:
@@ -289,16 +296,24 @@ class Engine:
         self._visits.put(closed)
         self._unweigh(opened.keyframes)
         stamp_s = opened.keyframes[-1].stamp_s
-        refined = self._refine(closed, stamp_s)
-        merged = audit.pruned(self._particles.merge(), stamp_s, "merged")
-        recognised = (*refined, *merged, *self._forget(stamp_s), *self._recognise(closed, stamp_s))
-        self._forget_visit(closed.visit - 1)
+        settled = self._settle(closed, stamp_s)
         arc = Factor(closed.visit, opened.visit, motion)
         self._motions.append(arc)
         expanded, branched = self._expand(opened, arc, stamp_s)
         self._visits.put(opened)
         pruned = audit.pruned(self._particles.replace(expanded), stamp_s)
-        return (*recognised, audit.entered(self._particles, stamp_s), *branched, *pruned)
+        return (*settled, audit.entered(self._particles, stamp_s), *branched, *pruned)
+
+    def _settle(self, visit: Visit, stamp_s: float) -> tuple[Event, ...]:
+        """Use all that a visit that is over has seen, and keep of the one before what is new."""
+        if visit.visit < self._frozen_visits:
+            return ()
+        refined = self._refine(visit, stamp_s)
+        merged = audit.pruned(self._particles.merge(), stamp_s, "merged")
+        forgotten = self._forget(stamp_s)
+        recognised = self._recognise(visit, stamp_s)
+        self._forget_visit(visit.visit - 1)
+        return (*refined, *merged, *forgotten, *recognised)
 
     def _forget(self, stamp_s: float) -> tuple[Event, ...]:
         """Drop what nothing has spoken for since long, and accept what alone is left."""
@@ -388,7 +403,8 @@ class Engine:
         The visits before and after it must have been refined, so that no arc to it is to come.
         """
         best, hypotheses = self._particles.best, self._particles.hypotheses
-        if visit < 0 or any(visit in h.topology.areas for h in hypotheses):
+        is_frozen = visit < self._frozen_visits
+        if visit < 0 or is_frozen or any(visit in h.topology.areas for h in hypotheses):
             return
         to_same = best.topology.visits_to[best.topology.assignments[visit].area]
         others = [v for v in to_same if v != visit and not self._visits.is_forgotten(v)]
@@ -425,6 +441,11 @@ class Engine:
         return events
 
     # ------------------------------------------------------------------ what readers may ask
+
+    @property
+    def is_frozen(self) -> bool:
+        """Whether the areas of the map that is gone on with stay as they are."""
+        return self._frozen_visits > 0
 
     @property
     def keyframes(self) -> int:
@@ -466,7 +487,8 @@ class Engine:
                 current_area=belief.current_area,
                 effective_sample_size=belief.effective_sample_size,
             ),
-            keyframe_index=visit.last_keyframe,
+            localization=self._particles.localization(belief.stamp_s, self._last_return_s()),
+            keyframe_index=visit.last_keyframe - self._first_of_session,
             area_from_keyframe=best.area_from_visit(visit.visit) @ visit_from_keyframe,
             reference_from_keyframe=best.graph.relative(0, visit.visit) @ visit_from_keyframe,
             reference_area=0,
@@ -474,6 +496,12 @@ class Engine:
             arcs=best.topology.arcs,
             keyframes=self.keyframes,
         )
+
+    def _last_return_s(self) -> float | None:
+        """Return when the robot last was where it had been before, in the best hypothesis."""
+        best = self._particles.best
+        visit = self._open.visit if best.sees is not None else best.topology.last_return
+        return None if visit is None else self._visits.last_stamp_s(visit)
 
     def global_map(
         self,
@@ -631,6 +659,12 @@ _LEAST_LOOK = 4
 _BRIDGED_M = 0.25
 
 
+def _frozen(config: Config) -> Config:
+    """Return the settings with which a session leaves no more than its path in known areas."""
+    areas = config.areas.model_copy(update={"max_views": 1, "max_new_share": 1.0})
+    return config.model_copy(update={"areas": areas})
+
+
 def _said_of(tracking: Tracking) -> list[str]:
     """Return what is counted of a scan."""
     registration = tracking.registration
@@ -645,13 +679,14 @@ def _entered(
     hypothesis: Hypothesis, visit: int, arc: Factor, successor: Successor, identifier: int
 ) -> Hypothesis:
     """Return a hypothesis that goes on with a visit where a successor says."""
-    area, place, new = successor.area, successor.area_from_visit, Assignment(visit, visit, None)
+    area, place, is_carried = successor.area, successor.area_from_visit, successor.is_carried
+    new = Assignment(visit, visit, None, is_carried)
     log_weight = hypothesis.log_weight + successor.log_factor
     extended = partial(hypothesis.extended, arc=arc, hypothesis=identifier, log_weight=log_weight)
     if area is None or place is None:
         return extended(new)
     if area != hypothesis.current.area or successor.overlap >= SAME_AREA:
-        return extended(Assignment(visit, area, place))
+        return extended(Assignment(visit, area, place, is_carried))
     # Who only sees into the area that he was in has left it.
     return extended(new).recognising(
         area, place, is_same_area=False, hypothesis=identifier, log_weight=log_weight

@@ -22,14 +22,16 @@ import networkx as nx
 import numpy as np
 import numpy.typing as npt
 
-from hmt_service.core.awakening import is_anywhere
+from hmt_service.core.awakening import anywhere, is_anywhere
 from hmt_service.core.geometry import (
     FloatArray,
     GaussianPose,
     Pose,
     adjoint,
+    confined,
     identity,
     inverse,
+    isotropic_covariance,
     planar_covariance,
     planar_pose,
     symmetric,
@@ -41,6 +43,8 @@ _REFERENCE_SIGMA = 1e-6
 # Poses that have moved farther than this, m and rad, are linearised anew.
 _RELINEARISED = 1e-5
 _MAX_UPDATES = 20
+# No number of observations, each worth centimetres, moves what is known so well.
+_FROZEN_M, _FROZEN_RAD = 1e-4, 1e-5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -325,6 +329,34 @@ class PoseGraph:
         graph._solver.begin(free, graph._factors.values())
         return graph
 
+    def frozen(self, area_of: Mapping[int, int]) -> PoseGraph:
+        """Return a graph in which all areas stay where they are, whatever is added.
+
+        Args:
+            area_of: The area of each visit: those that founded none keep their places beside it,
+                but the last, which the robot goes on from.
+        """
+        poses, is_planar = dict(enumerate(self.poses())), self.is_planar
+        last = len(poses) - 1
+        anchors = {v: area for v, area in area_of.items() if v not in (area, last)}
+        fixed = confined(
+            isotropic_covariance(sigma_rad=_FROZEN_RAD, sigma_m=_FROZEN_M), is_planar=is_planar
+        )
+        factors = []
+        rest = set(self._visits)
+        while rest:
+            first = min(rest)
+            part = self.part_of(first)
+            rest -= part
+            if first != 0:
+                factors.append(Factor(0, first, anywhere(is_planar=is_planar)))
+            factors += [
+                Factor(first, visit, GaussianPose(inverse(poses[first]) @ poses[visit], fixed))
+                for visit in sorted(part - {first})
+                if visit not in anchors
+            ]
+        return PoseGraph.restored(poses, factors, anchors, is_planar=is_planar)
+
     def part_of(self, visit: int) -> frozenset[int]:
         """Return the visits whose pose relative to one is known, that one included.
 
@@ -338,6 +370,11 @@ class PoseGraph:
         known.add_nodes_from(self._visits)
         known.add_edges_from((held, anchor) for held, (anchor, _) in self._held.items())
         return frozenset(nx.node_connected_component(known, visit))
+
+    @property
+    def is_planar(self) -> bool:
+        """Whether solved poses are kept planar exactly."""
+        return self._space is _PLANAR
 
     @property
     def is_whole(self) -> bool:
@@ -365,8 +402,7 @@ class PoseGraph:
         """Return a graph of the same arcs in which one part lies elsewhere."""
         poses = {v: moved @ self.pose(v) if v in part else self.pose(v) for v in self._visits}
         anchors = {visit: anchor for visit, (anchor, _) in self._held.items()}
-        is_planar = self._space is _PLANAR
-        return PoseGraph.restored(poses, self.factors, anchors, is_planar=is_planar)
+        return PoseGraph.restored(poses, self.factors, anchors, is_planar=self.is_planar)
 
     def copy(self) -> PoseGraph:
         """Return an independent graph that shares factors and solution until one changes."""

@@ -11,6 +11,7 @@ References:
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -19,7 +20,7 @@ from itertools import pairwise
 import numpy as np
 
 from hmt_service.core.alignment import SEPARATION_M, SEPARATION_RAD
-from hmt_service.core.awakening import is_anywhere
+from hmt_service.core.awakening import anywhere, is_anywhere
 from hmt_service.core.geometry import (
     FloatArray,
     GaussianPose,
@@ -31,7 +32,7 @@ from hmt_service.core.geometry import (
 )
 from hmt_service.core.graph import Factor, PoseGraph
 from hmt_service.core.submap import Visit
-from hmt_service.core.types import Belief, HypothesisSummary
+from hmt_service.core.types import Belief, HypothesisSummary, Localization
 
 SAME_AREA = 2.0 / 3.0
 """A visit was to an area, and did not only see into it, if the area explains so much of it."""
@@ -49,6 +50,8 @@ class Assignment:
     """The area: the visit that founded it."""
     area_from_visit: GaussianPose | None
     """Alignment with the founding visit; None when this visit founded the area."""
+    is_carried: bool = False
+    """Whether the robot was carried there: the motion since the visit before says nothing."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,6 +76,12 @@ class Topology:
     def arcs(self) -> int:
         """Number of pairs of areas that the robot has gone between directly."""
         return len({frozenset(pair) for pair in pairwise(self.path)})
+
+    @cached_property
+    def last_return(self) -> int | None:
+        """The latest visit to an area that was there before; None if there is none."""
+        returns = (a.visit for a in reversed(self.assignments) if a.area_from_visit is not None)
+        return next(returns, None)
 
     @cached_property
     def visits_to(self) -> Mapping[int, tuple[int, ...]]:
@@ -109,6 +118,12 @@ class Hypothesis:
         """The assignment of the visit that the robot is on."""
         return self.topology.assignments[-1]
 
+    @property
+    def is_placed(self) -> bool:
+        """Whether it is known where the robot is beside the first area."""
+        graph = self.graph
+        return graph.is_whole or not is_anywhere(graph.relative(0, self.current.visit))
+
     def area_from_visit(self, visit: int) -> GaussianPose:
         """Return the pose of a visit's frame in its area, with its own graph's covariance."""
         area = self.topology.assignments[visit].area
@@ -138,11 +153,14 @@ class Hypothesis:
 
         Args:
             assignment: Where the new visit is.
-            arc: Motion from the visit before to the new one.
+            arc: Motion from the visit before to the new one; says nothing if the robot was carried.
             hypothesis: Identifier of the successor.
             log_weight: Its log weight, not normalised.
         """
-        graph, place, arcs = self.graph.copy(), assignment.area_from_visit, [arc]
+        graph, place = self.graph.copy(), assignment.area_from_visit
+        if assignment.is_carried:
+            arc = replace(arc, a_from_b=anywhere(is_planar=graph.is_planar))
+        arcs = [arc]
         if place is not None:
             arcs.append(Factor(assignment.area, assignment.visit, place))
         # The first arc places the visit: a motion that says nothing comes last.
@@ -172,7 +190,8 @@ class Hypothesis:
         visit, topology = self.current.visit, self.topology
         graph = self.graph.joined(Factor(area, visit, area_from_visit))
         if is_same_area:
-            topology = topology.with_visit(Assignment(visit, area, area_from_visit))
+            assignment = replace(self.current, area=area, area_from_visit=area_from_visit)
+            topology = topology.with_visit(assignment)
         sees = None if is_same_area else area
         return Hypothesis(hypothesis, log_weight, topology, graph, self.unlikely_for, sees)
 
@@ -245,6 +264,23 @@ class ParticleLayer:
             area = hypothesis.current.area
             marginal[area] = marginal.get(area, 0.0) + float(probability)
         return marginal
+
+    def localization(self, stamp_s: float, evidence_stamp_s: float | None) -> Localization:
+        """Return how sure it is where in the map the robot is.
+
+        Args:
+            stamp_s: Sensor time of the last observation.
+            evidence_stamp_s: Sensor time when it was last where it had been before.
+        """
+        marginal, area = self.current_area(), self.best.current.area
+        placed = sum(
+            probability
+            for hypothesis, probability in zip(self._hypotheses, self.probabilities, strict=True)
+            if hypothesis.current.area == area and hypothesis.is_placed
+        )
+        # None is -0.0, or a rounding error above 1.
+        entropy_nat = max(0.0, -sum(p * math.log(p) for p in marginal.values() if p > 0.0))
+        return Localization(stamp_s, min(float(placed), 1.0), entropy_nat, evidence_stamp_s)
 
     def belief(self, stamp_s: float) -> Belief:
         """Return what is believed of where the robot is.

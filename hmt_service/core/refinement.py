@@ -16,7 +16,7 @@ from hmt_service.core.alignment import Aligner, Mode
 from hmt_service.core.config import Config, RefinementConfig
 from hmt_service.core.geometry import GaussianPose
 from hmt_service.core.graph import Factor
-from hmt_service.core.hypotheses import SAME_AREA, Assignment, Hypothesis
+from hmt_service.core.hypotheses import SAME_AREA, Hypothesis
 from hmt_service.core.submap import Visit
 from hmt_service.core.visits import Visits, gaps_m, share_new
 
@@ -78,7 +78,7 @@ class Refinement:
             new = share_new(visit, [visits[other] for other, _ in ties], graph.poses())
             if new <= 1.0 - SAME_AREA:
                 area, mode = max(ties, key=lambda tie: tie[1].overlap)
-                assignment = Assignment(visit.visit, area, mode.target_from_visit)
+                assignment = replace(assignment, area=area, area_from_visit=mode.target_from_visit)
         topology = hypothesis.topology.with_visit(assignment)
         return replace(hypothesis, graph=graph, topology=topology)
 

@@ -98,7 +98,7 @@ class Smoother:
         smoothed = poses.copy()
         if not ties:
             return smoothed
-        known = [*_motions(keyframes), *_alignments(hypothesis, kept)]
+        known = [*_motions(hypothesis, kept), *_alignments(hypothesis, kept)]
         solved = poses[indices]
         for _ in range(2):
             solved = optimised(solved, _one_per_pair([*known, *ties]), is_planar=self._is_planar)
@@ -203,16 +203,22 @@ def _is_unbroken(times: npt.NDArray[np.int64], first: int, second: int) -> bool:
     return bool(times[second] - times[first] == second - first)
 
 
-def _motions(keyframes: Sequence[Keyframe]) -> list[Factor]:
-    """Return the motions between neighbours.
+def _motions(hypothesis: Hypothesis, visits: Sequence[Visit]) -> list[Factor]:
+    """Return the motions between neighbours, unless the robot was carried from one to the other.
 
     What is wrong with a keyframe alone is in the motions to and from it; here both have it, as if
     apart: the trajectory then bends a little more freely to the ties, which hold it better.
     """
+    carried = {
+        visit.first_keyframe
+        for visit in visits
+        if hypothesis.topology.assignments[visit.visit].is_carried
+    }
+    keyframes = [keyframe for visit in visits for keyframe in visit.keyframes]
     return [
         Factor(before, before + 1, keyframe.previous_from_body)
         for before, (last, keyframe) in enumerate(pairwise(keyframes))
-        if keyframe.index == last.index + 1
+        if keyframe.index == last.index + 1 and keyframe.index not in carried
     ]
 
 

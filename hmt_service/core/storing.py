@@ -57,8 +57,16 @@ def restored_visits(stored: StoredMap, config: Config) -> Visits:
     return visits
 
 
-def restored_hypothesis(stored: StoredHypothesis, *, is_planar: bool) -> Hypothesis:
-    """Return a hypothesis as it was, with a graph of its own."""
+def restored_hypothesis(
+    stored: StoredHypothesis, *, is_planar: bool, is_frozen: bool
+) -> Hypothesis:
+    """Return a hypothesis as it was, with a graph of its own.
+
+    Args:
+        stored: What was stored of it.
+        is_planar: Whether solved poses are kept planar exactly.
+        is_frozen: Whether all areas stay where they are.
+    """
     area_of = {assignment.visit: assignment.area for assignment in stored.assignments}
     graph = PoseGraph.restored(
         stored.reference_from_visit,
@@ -66,6 +74,8 @@ def restored_hypothesis(stored: StoredHypothesis, *, is_planar: bool) -> Hypothe
         {visit: area_of[visit] for visit in sorted(_eliminated(stored))},
         is_planar=is_planar,
     )
+    if is_frozen:
+        graph = graph.frozen(area_of)
     assignments = tuple(Assignment(a.visit, a.area, a.area_from_visit) for a in stored.assignments)
     return Hypothesis(stored.hypothesis, stored.log_weight, Topology(assignments), graph)
 

@@ -6,14 +6,15 @@ References:
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
 from hmt_service.core.alignment import Aligner, Mode
-from hmt_service.core.awakening import anywhere_in, is_anywhere
+from hmt_service.core.awakening import anywhere, anywhere_in, is_anywhere
 from hmt_service.core.config import Config
 from hmt_service.core.geometry import (
     PLANAR_AXES,
@@ -48,6 +49,8 @@ class Successor:
     """Share of what the visit saw that the area explains, in [0, 1]; 0 for a new one."""
     log_factor: float
     """Log of the probability of entering here times that of the observations, up to a constant."""
+    is_carried: bool = False
+    """Whether the robot was carried there: the motion since the visit before says nothing."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,8 +124,25 @@ class Transition:
             visits: All closed visits.
 
         Returns:
-            A new area first, then each mode of each known area.
+            A new area first, then each mode of each known area; both again if the robot may have
+            been carried.
         """
+        moved = self._entries(hypothesis, visit, arc, visits)
+        if visit.keyframes[0].failure is None or is_anywhere(arc.a_from_b):
+            return moved
+        log_share = math.log(self._config.carried_share)
+        log_rest = math.log1p(-self._config.carried_share)
+        put_down = replace(arc, a_from_b=anywhere(is_planar=hypothesis.graph.is_planar))
+        carried = self._entries(hypothesis, visit, put_down, visits)
+        return (
+            *(replace(s, log_factor=s.log_factor + log_rest) for s in moved),
+            *(replace(s, log_factor=s.log_factor + log_share, is_carried=True) for s in carried),
+        )
+
+    def _entries(
+        self, hypothesis: Hypothesis, visit: Visit, arc: Factor, visits: Visits
+    ) -> tuple[Successor, ...]:
+        """Return every place that the new visit may be to if the motion is to be believed."""
         where = _Question(hypothesis, visit, arc.visit_a, arc.a_from_b, visits)
         candidates = self._candidates(where)
         outside = self._mass_outside(candidates, visit, visits)
@@ -179,11 +199,7 @@ class Transition:
     ) -> list[_Candidate]:
         """Return the areas whose extent the prior reaches, the nearest first."""
         hypothesis, known, known_from_visit = where.hypothesis, where.known, where.known_from_visit
-        most, graph = self._config.max_candidates, hypothesis.graph
-        # The visit before ended where its own content does. An older area may go on beyond that,
-        # and who does not know how he went may not have left at all.
-        is_known = is_certain(known_from_visit, self._refinement)
-        left = known if is_known and hypothesis.current.area == known else None
+        most, graph, left = self._config.max_candidates, hypothesis.graph, self._left(where)
         areas = np.array([a for a in hypothesis.topology.areas if a != left and a in where.part])
         if not len(areas):
             return []
@@ -201,6 +217,19 @@ class Transition:
                 if len(result) == most:
                     break
         return result
+
+    def _left(self, where: _Question) -> int | None:
+        """Return the area that the visit is certainly not to: the robot has just left it.
+
+        The visit before ended where its own content does; an older area may go on beyond that. Who
+        is lost, or does not know how he went, may not have left at all.
+        """
+        known = where.known
+        if known == where.visit.visit:
+            return known
+        is_lost = where.visit.keyframes[0].failure is not None
+        is_known = not is_lost and is_certain(where.known_from_visit, self._refinement)
+        return known if is_known and where.hypothesis.current.area == known else None
 
     def _anywhere(self, where: _Question, outside: float) -> list[_Candidate]:
         """Return the areas that the visit may be to because nobody knows where those are.

@@ -186,6 +186,22 @@ class Posterior:
 
 
 @dataclass(frozen=True, slots=True)
+class Localization:
+    """How sure it is where in the map the robot is."""
+
+    stamp_s: float
+    """Sensor time of the last keyframe in the map."""
+    probability: float
+    """Posterior mass of its current area where that has a place in the map, in [0, 1]; 0 after an
+    awakening until something ties it."""
+    entropy_nat: float
+    """Entropy of the marginal over the current area; 0 if there is no doubt."""
+    evidence_stamp_s: float | None
+    """Sensor time when the robot last was where it had been before, in the most probable
+    hypothesis: from then on the motion alone says where it is. None if it never was."""
+
+
+@dataclass(frozen=True, slots=True)
 class Belief:
     """What was believed of where the robot is, at one moment."""
 
@@ -223,6 +239,8 @@ class HmtPose:
     """Hypothesis that the answer belongs to."""
     probability: float
     """Posterior mass of the current area over all hypotheses."""
+    localization: Localization
+    """How sure it is that the robot is there."""
     revision: int
     """Map revision."""
 
@@ -346,8 +364,11 @@ class Snapshot:
 
     posterior: Posterior
     """Belief over topologies."""
+    localization: Localization
+    """How sure it is where the robot is."""
     keyframe_index: int
-    """Keyframe that the poses below are at."""
+    """Keyframe that the poses below are at, as the odometry of this session numbers them; negative
+    before its first, when they are those of the end of the session before."""
     area_from_keyframe: GaussianPose
     """Pose of that keyframe inside the current area of the best hypothesis."""
     reference_from_keyframe: GaussianPose

@@ -126,6 +126,11 @@ class Visits(Mapping[int, Visit]):
         kept = self._visits[visit]
         return len(kept.stamps_s if isinstance(kept, _Path) else kept.keyframes)
 
+    def last_stamp_s(self, visit: int) -> float:
+        """Return the sensor time of the last keyframe of a visit."""
+        kept = self._visits[visit]
+        return float(kept.stamps_s[-1] if isinstance(kept, _Path) else kept.keyframes[-1].stamp_s)
+
     def is_forgotten(self, visit: int) -> bool:
         """Return whether of a visit only the path is left."""
         return isinstance(self._visits[visit], _Path)

@@ -116,6 +116,8 @@ class Link:
                 message = load(data)
                 if isinstance(message, Ready):
                     self._is_ready = True
+                    if message.known is not None:
+                        self._receive(message.known, data)
                     continue
                 self._receive(message, data)
                 self._answered += 1

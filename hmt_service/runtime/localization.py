@@ -61,7 +61,8 @@ class Localizer:
 
     def _update(self) -> None:
         snapshot, tracking = self._snapshot, self._tracking
-        if snapshot is None or tracking is None:
+        # Before its first keyframe is in the map nothing is known of where a session began.
+        if snapshot is None or tracking is None or snapshot.keyframe_index < 0:
             return
         keyframe_from_body = self._chain @ tracking.keyframe_from_body
         posterior = snapshot.posterior
@@ -74,5 +75,6 @@ class Localizer:
             reference_from_body=snapshot.reference_from_keyframe @ keyframe_from_body,
             hypothesis=best.hypothesis,
             probability=posterior.current_area[best.current_area],
+            localization=snapshot.localization,
             revision=posterior.revision,
         )

@@ -46,6 +46,9 @@ class ProcessName(StrEnum):
 class Ready:
     """A child has loaded its libraries; the only message that is no answer."""
 
+    known: Mapped | None = None
+    """The map that it goes on with, if it does."""
+
 
 @dataclass(frozen=True, slots=True)
 class Stop:
@@ -194,6 +197,10 @@ class Keeper(Protocol):
     @property
     def path(self) -> Path:
         """The file."""
+
+    @property
+    def is_frozen(self) -> bool:
+        """Whether it is only read."""
 
     def engine(self, config: Config, *, seed: int) -> Engine:
         """Return an engine that goes on with the map in the file, or begins one."""

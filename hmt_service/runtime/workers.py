@@ -77,7 +77,7 @@ def run_topology(
     """Turn trackings into the map until the pipes end, and answer requests between two scans."""
     _leave_signals_to_parent()
     topology = _Topology(config, seed, save, keeper)
-    _send(work, Ready())
+    _send(work, Ready(topology.known()))
     for connection, message in _received(requests, work, idle=topology.rest):
         if connection is requests:
             _send(requests, topology.answer(message))
@@ -97,7 +97,7 @@ class _Topology:
             Engine(config, seed=seed) if keeper is None else keeper.engine(config, seed=seed)
         )
         self._save = save
-        self._keeper = keeper
+        self._keeper = None if keeper is None or keeper.is_frozen else keeper
         self._stored_keyframes = self._engine.keyframes
         self._kept_s = -math.inf
         self._pause_s = _KEEP_S
@@ -105,6 +105,11 @@ class _Topology:
         self._scans = 0
         self._odometry_busy_s = 0.0
         self._busy_s = 0.0
+
+    def known(self) -> Mapped | None:
+        """Return the map that is gone on with, if there is one."""
+        snapshot = self._engine.snapshot()
+        return None if snapshot is None else Mapped(snapshot, (), self._report())
 
     def map(self, tracked: Tracked) -> Mapped:
         """Take one scan into the map, unless what it is relative to was thrown away before.

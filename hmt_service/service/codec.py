@@ -27,6 +27,7 @@ from hmt_service.core.types import (
     History,
     HmtPose,
     HypothesisSummary,
+    Localization,
     MapMethod,
     PlacedArea,
     Posterior,
@@ -135,6 +136,7 @@ def _pose_to_proto(pose: HmtPose) -> pb.HmtPose:
         reference_from_body=_gaussian_to_proto(pose.reference_from_body),
         hypothesis=pose.hypothesis,
         probability=pose.probability,
+        localization=_localization_to_proto(pose.localization),
         revision=pose.revision,
     )
 
@@ -148,7 +150,27 @@ def _pose(message: pb.HmtPose) -> HmtPose:
         reference_from_body=_gaussian(message.reference_from_body),
         hypothesis=message.hypothesis,
         probability=message.probability,
+        localization=_localization(message.localization),
         revision=message.revision,
+    )
+
+
+def _localization_to_proto(localization: Localization) -> pb.Localization:
+    return pb.Localization(
+        stamp_s=localization.stamp_s,
+        probability=localization.probability,
+        entropy_nat=localization.entropy_nat,
+        evidence_stamp_s=localization.evidence_stamp_s,
+    )
+
+
+def _localization(message: pb.Localization) -> Localization:
+    has_evidence = message.HasField("evidence_stamp_s")
+    return Localization(
+        message.stamp_s,
+        message.probability,
+        message.entropy_nat,
+        message.evidence_stamp_s if has_evidence else None,
     )
 
 
@@ -369,6 +391,9 @@ def _status_to_proto(status: Status) -> pb.Status:
         keyframes=status.keyframes,
         hypotheses=status.hypotheses,
         stored_keyframes=status.stored_keyframes,
+        localization=(
+            None if status.localization is None else _localization_to_proto(status.localization)
+        ),
     )
 
 
@@ -408,6 +433,9 @@ def _status(message: pb.Status) -> Status:
         keyframes=message.keyframes,
         hypotheses=message.hypotheses,
         stored_keyframes=message.stored_keyframes,
+        localization=(
+            _localization(message.localization) if message.HasField("localization") else None
+        ),
     )
 
 

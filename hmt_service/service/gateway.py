@@ -195,6 +195,7 @@ class Gateway:
             keyframes=snapshot.keyframes if snapshot else 0,
             hypotheses=len(snapshot.posterior.hypotheses) if snapshot else 0,
             stored_keyframes=self._report.stored_keyframes,
+            localization=snapshot.localization if snapshot else None,
         )
 
     def on_tracking(self, tracking: Tracking) -> None:

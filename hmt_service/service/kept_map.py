@@ -22,6 +22,8 @@ class KeptMap:
 
     path: Path
     """The file; made when it does not exist."""
+    is_frozen: bool = False
+    """Whether it stays as it is: a session only finds its place in it."""
 
     def engine(self, config: Config, *, seed: int) -> Engine:
         """Return an engine that goes on with the map, or begins it.
@@ -31,14 +33,15 @@ class KeptMap:
             seed: Seed of all randomness.
 
         Raises:
+            NotFound: If the map is frozen, and there is none.
             InvalidInput: If the file is no map file, is damaged or was written by another version.
         """
         from hmt_service.core.engine import Engine
         from hmt_service.io.map_file import read_map
 
-        if not self.path.exists():
+        if not self.path.exists() and not self.is_frozen:
             return Engine(config, seed=seed)
-        return Engine.restored(read_map(self.path), seed=seed)
+        return Engine.restored(read_map(self.path), seed=seed, is_frozen=self.is_frozen)
 
     def write(self, engine: Engine) -> None:
         """Write the map, so that the file holds either the one before or all of this one.

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 
+from hmt_service.core.types import Localization
 from hmt_service.runtime.messages import ProcessStatus
 
 
@@ -78,6 +79,8 @@ class Status:
     """Hypotheses alive."""
     stored_keyframes: int
     """Keyframes that are in the map file, whatever happens now; zero without one."""
+    localization: Localization | None
+    """How sure it is where the robot is; None before the first keyframe."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -30,6 +30,8 @@ def save_results(
 ) -> tuple[str, ...]:
     """Write trajectory, map, events, beliefs and summary, each replaced as a whole.
 
+    A frozen map is not written again.
+
     Args:
         engine: What was built.
         report: What it has cost.
@@ -76,13 +78,15 @@ def save_results(
     directory.mkdir(parents=True, exist_ok=True)
     trajectory = engine.trajectory()
     _replace(directory / TRAJECTORY, lambda path: write_tum(path, trajectory))
-    write_map(directory / MAP, engine.stored())
+    if not engine.is_frozen:
+        write_map(directory / MAP, engine.stored())
     audit = engine.audit
     _replace(directory / EVENTS, lambda path: write_events(path, audit.events))
     _replace(directory / BELIEFS, lambda path: write_beliefs(path, audit.beliefs))
     text = json.dumps(summary, indent=2) + "\n"
     _replace(directory / SUMMARY, lambda path: path.write_text(text))
-    return TRAJECTORY, MAP, EVENTS, BELIEFS, SUMMARY
+    maps = () if engine.is_frozen else (MAP,)
+    return TRAJECTORY, *maps, EVENTS, BELIEFS, SUMMARY
 
 
 def _replace(path: Path, write: Callable[[Path], object]) -> None:

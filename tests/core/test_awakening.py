@@ -14,12 +14,35 @@ from hmt_service.core.engine import Engine
 from hmt_service.core.geometry import Pose, identity, inverse, log, planar_pose
 from hmt_service.core.graph import Factor, PoseGraph
 from hmt_service.core.odometry import Odometry
-from hmt_service.core.types import EventKind, MapMethod, TrackingFailure
+from hmt_service.core.stored import StoredMap, StoredVisit
+from hmt_service.core.types import EventKind, Keyframe, MapMethod, Scan, TrackingFailure
 from hmt_service.errors import InvalidInput
-from tests.core.factories import RING, Walls, box, drive, gaussian, motion_covariance, ring_path
+from tests.core.factories import (
+    BEAMS,
+    BEARINGS,
+    RING,
+    Walls,
+    box,
+    drive,
+    gaussian,
+    motion_covariance,
+    ring_path,
+)
 from tests.mapped import mapped
 
 LATER_S = 1000.0
+
+
+def carried(before: Sequence[Pose], after: Sequence[Pose]) -> Engine:
+    """Map a drive on which the wheels notice nothing of being lifted from one place to another."""
+    engine, odometry = Engine(load_config()), Odometry(load_config())
+    put_down = before[-1] @ inverse(after[0])
+    wheels = [*before, *(put_down @ pose for pose in after)]
+    noise = np.random.default_rng(2)
+    for reading in drive(RING, [*before, *after], odometry=wheels, noise=noise):
+        if (tracking := odometry.process(reading)) is not None:
+            engine.process(tracking)
+    return engine
 
 
 def travelled(engine: Engine, walls: Walls, path: Sequence[Pose]) -> Engine:
@@ -31,6 +54,10 @@ def travelled(engine: Engine, walls: Walls, path: Sequence[Pose]) -> Engine:
             assert not engine.misses(tracking)
             engine.process(tracking)
     return engine
+
+
+def _keyframes_of(stored: StoredMap, visit: StoredVisit) -> Sequence[Keyframe]:
+    return stored.keyframes[visit.first_keyframe : visit.last_keyframe + 1]
 
 
 @pytest.fixture(scope="module")
@@ -113,6 +140,94 @@ def test_who_wakes_up_outside_is_in_a_part_of_its_own_until_a_known_place_comes(
     assert found is not None
     assert found.posterior.current_area[found.posterior.hypotheses[0].current_area] > 0.95
     assert not is_anywhere(found.reference_from_keyframe)
+
+
+@pytest.mark.parametrize("there", [130, 190])
+def test_who_is_carried_away_finds_out_where_to(there: int) -> None:
+    lap, after = ring_path(laps=1.2), ring_path(laps=1.0)[there : there + 40]
+    engine = carried(lap, after)
+    lost = [event for event in engine.audit.events if event.kind is EventKind.LOST]
+    assert len(lost) == 1
+    snapshot = engine.snapshot()
+    assert snapshot is not None
+    # The sides of the ring are alike.
+    assert snapshot.localization.probability > 0.9
+    assert snapshot.localization.entropy_nat < 0.3
+    truth = inverse(lap[0]) @ after[-1]
+    for _ in range(2):
+        last = engine.trajectory()[-1].reference_from_body
+        assert np.abs(log(inverse(truth) @ last)[3:]).max() < 0.15
+        engine.finish()
+    # The way that nobody drove is no arc.
+    best = engine.global_map(MapMethod.CONSISTENT, with_points=False)
+    shortest = engine.global_map(MapMethod.SHORTEST_PATH, with_points=False)
+    for one, two in zip(best.areas, shortest.areas, strict=True):
+        apart = inverse(one.reference_from_area.mean) @ two.reference_from_area.mean
+        assert np.abs(log(apart)[3:]).max() < 0.3
+
+
+def test_a_scan_that_does_not_fit_is_no_reason_to_be_elsewhere() -> None:
+    lap = ring_path(laps=1.2)
+    engine, odometry = Engine(load_config()), Odometry(load_config())
+    readings = drive(RING, lap, odometry=lap, noise=np.random.default_rng(2))
+    # A crowd stands around the laser for a while.
+    rng = np.random.default_rng(0)
+    for index, reading in enumerate(readings):
+        if isinstance(reading, Scan) and 300 <= index < 320:
+            crowd = rng.uniform(0.3, 1.2, BEAMS)
+            points = np.stack([crowd * np.cos(BEARINGS), crowd * np.sin(BEARINGS), 0.0 * crowd])
+            reading = replace(reading, points_in_body=points.T)
+        if (tracking := odometry.process(reading)) is not None:
+            engine.process(tracking)
+    assert any(event.kind is EventKind.LOST for event in engine.audit.events)
+    snapshot = engine.snapshot()
+    assert snapshot is not None
+    assert snapshot.localization.probability > 0.95
+    truth = inverse(lap[0]) @ lap[-1]
+    assert np.abs(log(inverse(truth) @ engine.trajectory()[-1].reference_from_body)[3:]).max() < 0.3
+
+
+def test_it_is_told_how_sure_the_place_is(ring: Engine) -> None:
+    known, path = ring.stored(), ring_path(laps=0.8)[20:60]
+    before = Engine.restored(known).snapshot()
+    woken, found = (
+        travelled(Engine.restored(known), RING, way).snapshot() for way in (path[:2], path)
+    )
+    assert before is not None
+    assert before.keyframe_index == -1
+    assert woken is not None
+    assert found is not None
+    assert woken.localization.entropy_nat > found.localization.entropy_nat
+    assert found.localization.probability > 0.95
+    assert found.localization.evidence_stamp_s == pytest.approx(found.localization.stamp_s, abs=3.0)
+    # Outside of all that is known there is no place in the map, however sure the area is.
+    other = np.concatenate([box(0.0, 0.0, 9.0, 5.0), box(3.0, 3.0, 4.5, 3.6), box(6, 0.8, 7, 1.4)])
+    lost = travelled(
+        Engine.restored(known), other, [planar_pose(1.5 + 0.1 * i, 2.0, 0.0) for i in range(40)]
+    ).snapshot()
+    assert lost is not None
+    assert lost.localization.probability < 0.3
+
+
+def test_a_frozen_map_stays_as_it_is(ring: Engine) -> None:
+    known, path = ring.stored(), ring_path(laps=3.0)[20:]
+    engine = travelled(Engine.restored(known, is_frozen=True), RING, path)
+    engine.finish()
+    was, now = (e.global_map(MapMethod.CONSISTENT) for e in (ring, engine))
+    assert [area.area for area in now.areas] == [area.area for area in was.areas]
+    for one, two in zip(was.areas, now.areas, strict=True):
+        apart = inverse(one.reference_from_area.mean) @ two.reference_from_area.mean
+        assert np.abs(log(apart)).max() < 1e-4
+    truth = inverse(ring_path(laps=1.0)[0]) @ path[-1]
+    last = engine.trajectory()[-1].reference_from_body
+    assert np.abs(log(inverse(truth) @ last)[3:]).max() < 0.1
+    # Of the session no scans are kept but those of its last two visits.
+    stored = engine.stored()
+    gone, kept = stored.visits[len(known.visits) : -2], stored.visits[-2]
+    assert gone
+    for visit in gone:
+        assert not any(len(k.points_in_body) for k in _keyframes_of(stored, visit))
+    assert all(len(k.points_in_body) for k in _keyframes_of(stored, kept))
 
 
 def test_the_same_map_log_and_seed_give_the_same_map(ring: Engine) -> None:

@@ -8,6 +8,7 @@ from hmt_service.core.types import (
     HmtPose,
     HypothesisSummary,
     Keyframe,
+    Localization,
     Posterior,
     Snapshot,
     Tracking,
@@ -41,6 +42,7 @@ def snapshot(keyframe: int, area_from_keyframe: Pose, *, area: int = 7) -> Snaps
     reference_from_keyframe = planar_pose(100.0, 0.0, 0.0) @ area_from_keyframe
     return Snapshot(
         posterior,
+        Localization(float(keyframe), 0.9, 0.3, None),
         keyframe,
         gaussian(area_from_keyframe),
         gaussian(reference_from_keyframe),
@@ -85,6 +87,15 @@ def test_the_pose_is_composed_over_keyframes_that_the_map_does_not_have_yet() ->
     assert pose.area_from_body.covariance[2, 2] == pytest.approx(4 * VARIANCE)
     assert (pose.stamp_s, pose.revision, pose.hypothesis) == (2.5, 11, 3)
     assert pose.probability == 0.9
+
+
+def test_a_map_that_goes_on_says_nothing_of_where_the_session_began() -> None:
+    localizer = Localizer()
+    localizer.update(snapshot(-1, planar_pose(5.0, 5.0, 0.0)))
+    localizer.track(tracking(0, np.eye(4), becomes_keyframe=True))
+    assert localizer.pose is None
+    localizer.update(snapshot(0, planar_pose(1.0, 0.0, 0.0)))
+    assert located(localizer).localization.probability == 0.9
 
 
 def test_a_newer_map_replaces_the_steps_that_it_contains() -> None:

@@ -53,6 +53,7 @@ def running_daemon(
     is_awaited: bool = True,
     preset: Preset = Preset.PLANAR,
     map_file: Path | None = None,
+    is_frozen: bool = False,
 ) -> Iterator[RunningDaemon]:
     """Run a daemon that is killed at the end.
 
@@ -62,13 +63,14 @@ def running_daemon(
         is_awaited: Whether it shall be ready for work.
         preset: Kind of sensor that it expects.
         map_file: Map file to go on with.
+        is_frozen: Whether it stays as it is.
     """
     endpoint = router or free_endpoint()
     settings = out.parent / "settings.yaml"
     settings.write_text(SETTINGS)
     command = [sys.executable, "-m", "hmt_service", "serve", "--out", str(out)]
     if map_file is not None:
-        command += ["--map", str(map_file)]
+        command += ["--map", str(map_file), *(["--frozen"] if is_frozen else [])]
     if map_file is None or not map_file.exists():
         command += ["--preset", preset, "--config", str(settings)]
     meeting = ["--connect", router] if router else ["--listen", endpoint]

@@ -22,6 +22,7 @@ from hmt_service.core.types import (
     History,
     HmtPose,
     HypothesisSummary,
+    Localization,
     MapMethod,
     PlacedArea,
     Posterior,
@@ -52,8 +53,18 @@ def gaussians(draw: st.DrawFn) -> GaussianPose:
     return GaussianPose(exp(np.array(draw(tangents))), factor)
 
 
+localizations = st.builds(Localization, reals, shares, reals, st.none() | reals)
 poses = st.builds(
-    HmtPose, reals, ids, gaussians(), ids, gaussians(), ids, shares, st.integers(0, 2**60)
+    HmtPose,
+    reals,
+    ids,
+    gaussians(),
+    ids,
+    gaussians(),
+    ids,
+    shares,
+    localizations,
+    st.integers(0, 2**60),
 )
 summaries = st.builds(
     HypothesisSummary, ids, shares, ids, st.lists(ids, max_size=5).map(tuple), ids, ids
@@ -116,6 +127,7 @@ statuses = st.builds(
     ids,
     ids,
     ids,
+    st.none() | localizations,
 )
 acks = st.builds(Ack, counts, counts, counts, counts, st.lists(texts, max_size=3).map(tuple))
 

@@ -140,6 +140,38 @@ def test_a_file_that_is_no_map_of_this_version_is_refused_and_left_alone(
     assert known.read_bytes() == damaged
 
 
+def test_a_frozen_map_is_only_read(tmp_path: Path) -> None:
+    known, out = map_file_in(tmp_path), tmp_path / "out"
+    before, keyframes = known.read_bytes(), len(mapped().stored().keyframes)
+    with (
+        running_daemon(out, map_file=known, is_frozen=True) as daemon,
+        daemon.client() as client,
+    ):
+        # What the map is, is known before anything comes.
+        wait_for(client, "keyframes", keyframes)
+        publish(client, 0, 120, later_s=1e4)
+        wait_for(client, "processed_scans", 120)
+        status, pose = client.status(), client.pose()
+        assert status.stored_keyframes == keyframes < status.keyframes
+        assert status.localization is not None
+        assert status.localization.probability > 0.8
+        assert pose.localization.evidence_stamp_s == pytest.approx(pose.stamp_s, abs=3.0)
+        assert "map.hmt" not in client.save().files
+    assert known.read_bytes() == before
+    assert not (out / "map.hmt").exists()
+
+
+@pytest.mark.parametrize("command", ["serve", "run"])
+def test_only_a_map_that_there_is_can_be_frozen(tmp_path: Path, command: str) -> None:
+    log = [str(tmp_path / "log.mcap"), "--out", str(tmp_path / "out")] if command == "run" else []
+    nothing = CliRunner().invoke(app, [command, *log, "--frozen"])
+    assert "--frozen needs the map that --map names" in str(nothing.exception)
+    missing = ["--map", str(tmp_path / "no.hmt"), "--frozen"]
+    assert "no.hmt does not exist" in str(
+        CliRunner().invoke(app, [command, *log, *missing]).exception
+    )
+
+
 def test_damage_that_only_the_digest_shows_is_refused(tmp_path: Path) -> None:
     known = map_file_in(tmp_path)
     with closing(sqlite3.connect(known)) as database:

@@ -87,8 +87,20 @@ class GaussianPose(_message.Message):
     covariance: _containers.RepeatedScalarFieldContainer[float]
     def __init__(self, x_m: _Optional[float] = ..., y_m: _Optional[float] = ..., z_m: _Optional[float] = ..., qx: _Optional[float] = ..., qy: _Optional[float] = ..., qz: _Optional[float] = ..., qw: _Optional[float] = ..., covariance: _Optional[_Iterable[float]] = ...) -> None: ...
 
+class Localization(_message.Message):
+    __slots__ = ("stamp_s", "probability", "entropy_nat", "evidence_stamp_s")
+    STAMP_S_FIELD_NUMBER: _ClassVar[int]
+    PROBABILITY_FIELD_NUMBER: _ClassVar[int]
+    ENTROPY_NAT_FIELD_NUMBER: _ClassVar[int]
+    EVIDENCE_STAMP_S_FIELD_NUMBER: _ClassVar[int]
+    stamp_s: float
+    probability: float
+    entropy_nat: float
+    evidence_stamp_s: float
+    def __init__(self, stamp_s: _Optional[float] = ..., probability: _Optional[float] = ..., entropy_nat: _Optional[float] = ..., evidence_stamp_s: _Optional[float] = ...) -> None: ...
+
 class HmtPose(_message.Message):
-    __slots__ = ("stamp_s", "area", "area_from_body", "reference_area", "reference_from_body", "hypothesis", "probability", "revision")
+    __slots__ = ("stamp_s", "area", "area_from_body", "reference_area", "reference_from_body", "hypothesis", "probability", "revision", "localization")
     STAMP_S_FIELD_NUMBER: _ClassVar[int]
     AREA_FIELD_NUMBER: _ClassVar[int]
     AREA_FROM_BODY_FIELD_NUMBER: _ClassVar[int]
@@ -97,6 +109,7 @@ class HmtPose(_message.Message):
     HYPOTHESIS_FIELD_NUMBER: _ClassVar[int]
     PROBABILITY_FIELD_NUMBER: _ClassVar[int]
     REVISION_FIELD_NUMBER: _ClassVar[int]
+    LOCALIZATION_FIELD_NUMBER: _ClassVar[int]
     stamp_s: float
     area: int
     area_from_body: GaussianPose
@@ -105,7 +118,8 @@ class HmtPose(_message.Message):
     hypothesis: int
     probability: float
     revision: int
-    def __init__(self, stamp_s: _Optional[float] = ..., area: _Optional[int] = ..., area_from_body: _Optional[_Union[GaussianPose, _Mapping]] = ..., reference_area: _Optional[int] = ..., reference_from_body: _Optional[_Union[GaussianPose, _Mapping]] = ..., hypothesis: _Optional[int] = ..., probability: _Optional[float] = ..., revision: _Optional[int] = ...) -> None: ...
+    localization: Localization
+    def __init__(self, stamp_s: _Optional[float] = ..., area: _Optional[int] = ..., area_from_body: _Optional[_Union[GaussianPose, _Mapping]] = ..., reference_area: _Optional[int] = ..., reference_from_body: _Optional[_Union[GaussianPose, _Mapping]] = ..., hypothesis: _Optional[int] = ..., probability: _Optional[float] = ..., revision: _Optional[int] = ..., localization: _Optional[_Union[Localization, _Mapping]] = ...) -> None: ...
 
 class HypothesisSummary(_message.Message):
     __slots__ = ("hypothesis", "probability", "current_area", "topological_path", "areas", "loop_closures")
@@ -327,7 +341,7 @@ class InputCounts(_message.Message):
     def __init__(self, received: _Optional[int] = ..., accepted: _Optional[int] = ..., refused: _Optional[_Mapping[str, int]] = ..., queued: _Optional[int] = ..., queued_bytes: _Optional[int] = ..., discarded: _Optional[int] = ..., reordering: _Optional[int] = ..., dropped_beams: _Optional[_Mapping[str, int]] = ...) -> None: ...
 
 class Status(_message.Message):
-    __slots__ = ("version", "config_hash", "state", "uptime_s", "input", "tracked_scans", "processed_scans", "processes", "revision", "areas", "arcs", "keyframes", "hypotheses", "stored_keyframes")
+    __slots__ = ("version", "config_hash", "state", "uptime_s", "input", "tracked_scans", "processed_scans", "processes", "revision", "areas", "arcs", "keyframes", "hypotheses", "stored_keyframes", "localization")
     VERSION_FIELD_NUMBER: _ClassVar[int]
     CONFIG_HASH_FIELD_NUMBER: _ClassVar[int]
     STATE_FIELD_NUMBER: _ClassVar[int]
@@ -342,6 +356,7 @@ class Status(_message.Message):
     KEYFRAMES_FIELD_NUMBER: _ClassVar[int]
     HYPOTHESES_FIELD_NUMBER: _ClassVar[int]
     STORED_KEYFRAMES_FIELD_NUMBER: _ClassVar[int]
+    LOCALIZATION_FIELD_NUMBER: _ClassVar[int]
     version: str
     config_hash: str
     state: DaemonState
@@ -356,7 +371,8 @@ class Status(_message.Message):
     keyframes: int
     hypotheses: int
     stored_keyframes: int
-    def __init__(self, version: _Optional[str] = ..., config_hash: _Optional[str] = ..., state: _Optional[_Union[DaemonState, str]] = ..., uptime_s: _Optional[float] = ..., input: _Optional[_Union[InputCounts, _Mapping]] = ..., tracked_scans: _Optional[int] = ..., processed_scans: _Optional[int] = ..., processes: _Optional[_Iterable[_Union[ProcessStatus, _Mapping]]] = ..., revision: _Optional[int] = ..., areas: _Optional[int] = ..., arcs: _Optional[int] = ..., keyframes: _Optional[int] = ..., hypotheses: _Optional[int] = ..., stored_keyframes: _Optional[int] = ...) -> None: ...
+    localization: Localization
+    def __init__(self, version: _Optional[str] = ..., config_hash: _Optional[str] = ..., state: _Optional[_Union[DaemonState, str]] = ..., uptime_s: _Optional[float] = ..., input: _Optional[_Union[InputCounts, _Mapping]] = ..., tracked_scans: _Optional[int] = ..., processed_scans: _Optional[int] = ..., processes: _Optional[_Iterable[_Union[ProcessStatus, _Mapping]]] = ..., revision: _Optional[int] = ..., areas: _Optional[int] = ..., arcs: _Optional[int] = ..., keyframes: _Optional[int] = ..., hypotheses: _Optional[int] = ..., stored_keyframes: _Optional[int] = ..., localization: _Optional[_Union[Localization, _Mapping]] = ...) -> None: ...
 
 class Ack(_message.Message):
     __slots__ = ("received", "accepted", "refused", "processed_scans", "files")
