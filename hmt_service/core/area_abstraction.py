@@ -40,8 +40,13 @@ def cells_of(points: FloatArray, cell_size_m: float) -> Cells:
         points: Points in the frame of the area, shape (N, 3), m, within 10^6 cells of its origin.
         cell_size_m: Edge of a cell.
     """
+    return np.unique(cell_of_each(points, cell_size_m))
+
+
+def cell_of_each(points: FloatArray, cell_size_m: float) -> npt.NDArray[np.int64]:
+    """Return the cell of each point, shape (N,); see `cells_of`."""
     cells = np.floor(points / cell_size_m).astype(np.int64) + (1 << (_CELL_BITS - 1))
-    return np.unique((cells[:, 0] << 2 * _CELL_BITS) | (cells[:, 1] << _CELL_BITS) | cells[:, 2])
+    return np.asarray((cells[:, 0] << 2 * _CELL_BITS) | (cells[:, 1] << _CELL_BITS) | cells[:, 2])
 
 
 def overlap_of(cells: Sequence[Cells]) -> FloatArray:

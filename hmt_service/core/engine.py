@@ -45,7 +45,7 @@ from hmt_service.core.storing import (
     stored_hypothesis,
     stored_visits,
 )
-from hmt_service.core.submap import Visit, as_points, visit_of
+from hmt_service.core.submap import News, Visit, as_points, visit_of
 from hmt_service.core.transition import Successor, Transition
 from hmt_service.core.types import (
     NO_POINTS,
@@ -256,7 +256,7 @@ class Engine:
         """
         refined: tuple[Event, ...] = ()
         if self._revision > self._finished_revision:
-            refined = self._audited(self._refine(self._open, self._open.keyframes[-1].stamp_s))
+            refined = self._audited(self._refined(self._open, self._open.keyframes[-1].stamp_s))
             self._revision += 1
             self._finished_revision = self._revision
         if is_urgent or self.is_frozen or not self._visits or self._smooth_poses() is not None:
@@ -308,12 +308,16 @@ class Engine:
         """Use all that a visit that is over has seen, and keep of the one before what is new."""
         if visit.visit < self._frozen_visits:
             return ()
-        refined = self._refine(visit, stamp_s)
-        merged = audit.pruned(self._particles.merge(), stamp_s, "merged")
+        refined = self._refined(visit, stamp_s)
         forgotten = self._forget(stamp_s)
         recognised = self._recognise(visit, stamp_s)
         self._forget_visit(visit.visit - 1)
-        return (*refined, *merged, *forgotten, *recognised)
+        return (*refined, *forgotten, *recognised)
+
+    def _refined(self, visit: Visit, stamp_s: float) -> tuple[Event, ...]:
+        """Refine all hypotheses, and keep one of those that are the same map since."""
+        refined = self._refine(visit, stamp_s)
+        return (*refined, *audit.pruned(self._particles.merge(), stamp_s, "merged"))
 
     def _forget(self, stamp_s: float) -> tuple[Event, ...]:
         """Drop what nothing has spoken for since long, and accept what alone is left."""
@@ -372,13 +376,14 @@ class Engine:
         """Multiply the weights by the predictive likelihood of a keyframe, Eq. (12)."""
         if len(self._particles.hypotheses) == 1:
             return ()
-        evidence = {h.hypothesis: self._evidence(h, keyframe) for h in self._particles.hypotheses}
+        news = self._open.news_of(len(self._open.keyframes) - 1)
+        evidence = {h.hypothesis: self._evidence(h, news) for h in self._particles.hypotheses}
         self._weighed[keyframe.index] = evidence
         dropped = self._particles.reweight(lambda h: evidence[h.hypothesis])
         return audit.pruned(dropped, keyframe.stamp_s)
 
-    def _evidence(self, hypothesis: Hypothesis, keyframe: Keyframe) -> float:
-        """Return what the latest keyframe says for a hypothesis, against the background."""
+    def _evidence(self, hypothesis: Hypothesis, news: News) -> float:
+        """Return what the news say for a hypothesis, against the background."""
         visit, area = self._open, hypothesis.current.area
         if area == visit.visit:
             if hypothesis.sees is None:
@@ -387,8 +392,7 @@ class Engine:
         area_from_visit = inverse(hypothesis.graph.pose(area)) @ hypothesis.graph.pose(visit.visit)
         pose = area_from_visit @ visit.visit_from_keyframe[-1].mean
         known = self._visits[area].known_from(pose[:3, 3])
-        log_ratio = self._observation.log_ratio(keyframe, known, pose)
-        return visit.novelty[-1] * log_ratio
+        return news.share * self._observation.log_ratio(news.keyframe, known, pose)
 
     def _unweigh(self, keyframes: Sequence[Keyframe]) -> None:
         """Take back what keyframes said as part of a visit that they turned out not to be in."""

@@ -11,14 +11,14 @@ References:
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
 
-from hmt_service.core.area_abstraction import Cells, cells_of
+from hmt_service.core.area_abstraction import Cells, cell_of_each, cells_of
 from hmt_service.core.config import Config
 from hmt_service.core.correlation import View
 from hmt_service.core.geometry import (
@@ -41,6 +41,21 @@ _SUBMAP_CELLS = 0.5
 # Surfels and views take several times what the points do: of so many visits they are kept, the last
 # used.
 _LOCAL_MAPS = 24
+_NO_CELLS: Cells = np.zeros(0, dtype=np.int64)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class News:
+    """What a keyframe shows that none before it in its visit did.
+
+    Two looks at one wall are not two pieces of evidence; and how well the known walls fit once more
+    must not drown what the first look behind one of them says.
+    """
+
+    keyframe: Keyframe
+    """The keyframe with those points only that are in cells that no keyframe before it saw."""
+    share: float
+    """Share of its points that these are, in [0, 1]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,17 +126,22 @@ class Visit:
         return whole.thinned(odometry.voxel_size_m, 2 * odometry.max_points)
 
     @cached_property
-    def novelty(self) -> tuple[float, ...]:
-        """Share of the cells of each keyframe that no keyframe before it saw, in [0, 1].
+    def news(self) -> tuple[News, ...]:
+        """What each keyframe shows that none before it did."""
+        return tuple(map(self.news_of, range(len(self.keyframes))))
 
-        Two looks at one wall are not two pieces of evidence: what a keyframe says counts with this.
+    def news_of(self, position: int) -> News:
+        """Return what a keyframe shows that none before it did.
+
+        Args:
+            position: Its place in the visit, from 0.
         """
-        seen, shares = self.cells[0], [1.0]
-        for cells in self.cells[1:]:
-            together = np.union1d(seen, cells)
-            shares.append((len(together) - len(seen)) / max(len(cells), 1))
-            seen = together
-        return tuple(shares)
+        keyframe, pose = self.keyframes[position], self.visit_from_keyframe[position]
+        points = transform_points(pose.mean, keyframe.points_in_body)
+        own = cell_of_each(points, self.config.areas.cell_size_m)
+        is_new = np.isin(own, np.concatenate([_NO_CELLS, *self.cells[:position]]), invert=True)
+        seen_first = replace(keyframe, points_in_body=keyframe.points_in_body[is_new])
+        return News(seen_first, float(is_new.sum()) / max(len(is_new), 1))
 
     def points_in(self, frame_from_visit: Pose) -> FloatArray:
         """Return the submap in another frame, shape (N, 3), m."""

@@ -279,8 +279,9 @@ class Transition:
         peak = prior.fuse(mode.target_from_visit).mean
         poses = [peak @ pose.mean for pose in visit.visit_from_keyframe]
         log_ratio = sum(
-            novelty * self._observation.log_ratio(keyframe, target.known_from(pose[:3, 3]), pose)
-            for keyframe, pose, novelty in zip(visit.keyframes, poses, visit.novelty, strict=True)
+            news.share
+            * self._observation.log_ratio(news.keyframe, target.known_from(pose[:3, 3]), pose)
+            for news, pose in zip(visit.news, poses, strict=True)
         )
         return log_ratio + self._log_prior(prior, mode, self._widening(visit, mode))
 
@@ -290,7 +291,7 @@ class Transition:
         The registration takes each point for an independent reading; the observation model knows
         better, and how far off a range may be.
         """
-        readings = self._beams.independent_beams * sum(visit.novelty)
+        readings = self._beams.independent_beams * sum(n.share for n in visit.news)
         wider = (self._beams.hit_sigma_m / self._sigma_submap_m) ** 2
         return max(1.0, mode.overlap * len(visit.sweep.points) / readings * wider)
 

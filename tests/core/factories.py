@@ -3,23 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 
 from hmt_service.core.config import Config, load_config
+from hmt_service.core.engine import Engine
 from hmt_service.core.geometry import (
     FloatArray,
     GaussianPose,
     Pose,
     certain,
     exp,
+    identity,
     inverse,
     planar_pose,
 )
 from hmt_service.core.submap import Visit, visit_of
 from hmt_service.core.surfels import Indices, Surfels, _match, build_surfels, directions_of
-from hmt_service.core.types import Keyframe, OdometryReading, Reading, Scan
+from hmt_service.core.types import Keyframe, OdometryReading, Reading, Scan, Snapshot, Tracking
 
 Walls = FloatArray
 """Wall segments x0, y0, x1, y1, shape (W, 4), m."""
@@ -31,6 +34,10 @@ BEARINGS = np.linspace(-np.pi, np.pi, BEAMS, endpoint=False)
 def box(x0: float, y0: float, x1: float, y1: float) -> Walls:
     corners = [(x0, y0), (x1, y0), (x1, y1), (x0, y1), (x0, y0)]
     return np.array([[*a, *b] for a, b in pairwise(corners)])
+
+
+def shifted(walls: Walls, x_m: float, y_m: float = 0.0) -> Walls:
+    return np.asarray(walls + np.array([x_m, y_m, x_m, y_m]))
 
 
 SQUARE = box(-4.0, -4.0, 4.0, 4.0)
@@ -118,6 +125,40 @@ def visit_along(
     walls: Walls, path: Sequence[Pose], *, visit: int = 0, config: Config | None = None
 ) -> Visit:
     return visit_of(visit, keyframes_along(walls, path), config or load_config())
+
+
+def trackings_of(
+    *stays: tuple[Walls, Sequence[Pose], GaussianPose], noise: np.random.Generator | None = None
+) -> list[Tracking]:
+    """Return a tracking per keyframe of some stays, each entered by an uncertain motion."""
+    result: list[Tracking] = []
+    for walls, path, motion in stays:
+        keyframes = keyframes_along(walls, path, first=len(result), noise=noise)
+        entered = replace(keyframes[0], previous_from_body=motion)
+        result += [
+            Tracking(k.stamp_s, k.index, certain(identity()), k) for k in (entered, *keyframes[1:])
+        ]
+    return result
+
+
+def processed(
+    trackings: Sequence[Tracking], config: Config | None = None, *, known: Engine | None = None
+) -> tuple[Engine, list[Snapshot]]:
+    """Return an engine that has taken some trackings, and its state after each.
+
+    Args:
+        trackings: What it takes.
+        config: Its settings; None for those of a planar laser.
+        known: An engine that is to go on; None for a new one.
+    """
+    engine = known or Engine(config or load_config(), seed=3)
+    snapshots = []
+    for tracking in trackings:
+        engine.process(tracking)
+        snapshot = engine.snapshot()
+        assert snapshot is not None
+        snapshots.append(snapshot)
+    return engine, snapshots
 
 
 def line(start: Pose, *, length_m: float, step_m: float = 0.5) -> list[Pose]:

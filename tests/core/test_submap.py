@@ -130,3 +130,24 @@ def test_own_errors_cancel_along_the_path() -> None:
     assert later.visit_from_keyframe[-1].covariance[3, 3] == pytest.approx(
         ends + 10 * drift[3, 3], rel=1e-6
     )
+
+
+def test_news_are_the_points_in_cells_that_no_keyframe_before_saw() -> None:
+    size_m = VISIT.config.areas.cell_size_m
+    assert VISIT.news[0].share == 1.0
+    assert VISIT.news_of(3).share == VISIT.news[3].share
+    for position, news in enumerate(VISIT.news):
+        keyframe, pose = VISIT.keyframes[position], VISIT.visit_from_keyframe[position].mean
+        seen: set[int] = set().union(*(cells.tolist() for cells in VISIT.cells[:position]))
+        is_new = [
+            cells_of(transform_points(pose, point[None]), size_m)[0] not in seen
+            for point in keyframe.points_in_body
+        ]
+        assert np.array_equal(news.keyframe.points_in_body, keyframe.points_in_body[is_new])
+        assert news.share == pytest.approx(np.mean(is_new))
+
+
+def test_second_look_from_the_same_place_is_no_news() -> None:
+    twice = visit_along(ROOM, [START, START])
+    assert twice.news[1].share == 0.0
+    assert not len(twice.news[1].keyframe.points_in_body)

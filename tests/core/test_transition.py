@@ -156,7 +156,7 @@ def test_unlikely_pose_counts_less() -> None:
     visit = visit_along(WORLD, IN_ROOM, visit=2)
     observed, points = CONFIG.observation, len(visit.sweep.points)
     mode = Aligner(CONFIG).modes(visit, visits[0], GaussianPose(identity(), 0.1 * np.eye(6)))[0]
-    readings = observed.independent_beams * sum(visit.novelty)
+    readings = observed.independent_beams * sum(news.share for news in visit.news)
     wider = points / readings * (observed.hit_sigma_m / CONFIG.covariance.sigma_submap_m) ** 2
     bend = mode.target_from_visit.covariance - mode.width
     together = (0.3**2 + 0.1**2) + bend[3, 3] + wider * mode.width[3, 3]
