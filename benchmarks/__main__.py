@@ -50,6 +50,7 @@ class Name(StrEnum):
 
     ACCURACY = "accuracy"
     BELIEF = "belief"
+    HYPOTHESES = "hypotheses"
     AWAKENING = "awakening"
     TABLE2 = "table2"
     PEERS = "peers"

@@ -22,7 +22,7 @@ import psutil
 from benchmarks.handover import PoseRecord, Record, SweepRecord, read_records, write_record
 from benchmarks.processes import MemorySample, run_child
 from benchmarks.stages import StageClock
-from hmt_service.core.config import Preset, load_config
+from hmt_service.core.config import Config
 from hmt_service.core.geometry import FloatArray
 from hmt_service.core.types import Event, EventKind, OdometryReading, Reading, Scan, StampedPose
 from hmt_service.runtime.offline import map_readings
@@ -78,13 +78,13 @@ def write_reading(file: BinaryIO, reading: Reading) -> None:
 
 
 def run_chain(
-    readings: Path, preset: Preset, folder: Path, *, timeout_s: float, has_odometry: bool = True
+    readings: Path, config: Config, folder: Path, *, timeout_s: float, has_odometry: bool = True
 ) -> ChainRun:
     """Map the readings of a file in a process of its own.
 
     Args:
         readings: File that `write_readings` has written.
-        preset: Settings for the kind of sensor.
+        config: Settings of all stages.
         folder: Where the process may leave its result.
         timeout_s: Longest that it may take.
         has_odometry: Whether it may use the odometry among the readings.
@@ -93,7 +93,7 @@ def run_chain(
         ChildFailed: If it fails or takes longer.
     """
     result = folder / "chain.npz"
-    arguments = [readings.resolve(), result.resolve(), preset.value]
+    arguments = [str(readings.resolve()), str(result.resolve()), config.model_dump_json()]
     child = run_child(
         [sys.executable, "-m", __name__, *arguments, *([] if has_odometry else [_SCANS_ONLY])],
         timeout_s=timeout_s,
@@ -132,7 +132,7 @@ def read_readings(path: Path) -> Iterator[Reading]:
             yield Scan(record.stamp_s, record.points, record.sensor, record.times)
 
 
-def _map(readings: Iterable[Reading], result: Path, preset: Preset) -> None:
+def _map(readings: Iterable[Reading], result: Path, config: Config) -> None:
     """Map in this process, and leave what it did and cost in a file."""
     process, clock = psutil.Process(), StageClock(now_s=time.process_time)
     empty_bytes: list[float] = []
@@ -155,7 +155,7 @@ def _map(readings: Iterable[Reading], result: Path, preset: Preset) -> None:
     with tempfile.TemporaryFile() as file, clock.running():
         engine, cost = map_readings(
             measured(),
-            load_config(preset),
+            config,
             on_scan=lambda: file.write(row().tobytes()),
             on_event=enter,
         )
@@ -177,13 +177,13 @@ def _map(readings: Iterable[Reading], result: Path, preset: Preset) -> None:
     )
 
 
-def _main(readings: str, result: str, preset: str, *options: str) -> None:
+def _main(readings: str, result: str, config: str, *options: str) -> None:
     kept = (
         reading
         for reading in read_readings(Path(readings))
         if isinstance(reading, Scan) or _SCANS_ONLY not in options
     )
-    _map(kept, Path(result), Preset(preset))
+    _map(kept, Path(result), Config.model_validate_json(config))
 
 
 if __name__ == "__main__":

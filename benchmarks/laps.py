@@ -22,7 +22,7 @@ from benchmarks.metric import Direction, Metric
 from benchmarks.report import Report, Run
 from benchmarks.simulated import readings_of
 from benchmarks.trajectories import trajectory_errors
-from hmt_service.core.config import Preset
+from hmt_service.core.config import load_config
 from hmt_service.core.geometry import FloatArray
 from hmt_service.core.types import StampedPose
 
@@ -103,7 +103,7 @@ def _driven(laps: int) -> Result:
         folder = Path(name)
         drive = simulate(world, USUAL_ROBOTS[Family.ALIASED], _SEED)
         write_readings(readings_of(drive, truth), folder / "readings")
-        chain = run_chain(folder / "readings", Preset.PLANAR, folder, timeout_s=_TIMEOUT_S)
+        chain = run_chain(folder / "readings", load_config(), folder, timeout_s=_TIMEOUT_S)
     positions = np.array([pose.reference_from_body[:3, 3] for pose in truth])
     return _result(chain, truth, ends_of_laps(positions, lap_m, laps))
 

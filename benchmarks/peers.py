@@ -140,7 +140,9 @@ def _compare(python: Path, source: Source) -> Result:
         folder = Path(name)
         readings = folder / "readings"
         truth = source(readings)
-        chain = partial(run_chain, readings, Preset.OUTDOOR, folder, timeout_s=_TIMEOUT_S)
+        chain = partial(
+            run_chain, readings, load_config(Preset.OUTDOOR), folder, timeout_s=_TIMEOUT_S
+        )
         runs: dict[str, ChainRun | KissSlamRun] = {"hmt": chain()}
         if any(isinstance(reading, OdometryReading) for reading in read_readings(readings)):
             runs["hmt_scans_only"] = chain(has_odometry=False)

@@ -35,7 +35,7 @@ from benchmarks.rbpf import RbpfRun, find_rbpf, run_rbpf
 from benchmarks.recordings import Missing, first_scans, read_recorded, recorded_file
 from benchmarks.report import Report, Run
 from benchmarks.stages import Stage
-from hmt_service.core.config import Preset, load_config
+from hmt_service.core.config import load_config
 from hmt_service.core.geometry import FloatArray
 from hmt_service.core.types import StampedPose
 from hmt_service.io.relations import evaluate, read_relations
@@ -102,7 +102,7 @@ def _compare(program: Path, path: Path, log: _Log, is_quick: bool) -> Result:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         scans = write_readings(readings, folder / "readings")
-        ours = run_chain(folder / "readings", Preset.PLANAR, folder, timeout_s=_TIMEOUT_S)
+        ours = run_chain(folder / "readings", load_config(), folder, timeout_s=_TIMEOUT_S)
         at = np.unique(np.linspace(0, scans - 1, _POINTS_IN_A_CURVE).astype(int))
         theirs = run_rbpf(program, readings, folder, timeout_s=_TIMEOUT_S)
     return {

@@ -11,7 +11,7 @@ import pytest
 from benchmarks.chain import ChainRun, read_readings, run_chain, write_readings
 from benchmarks.processes import ChildFailed
 from benchmarks.stages import Stage
-from hmt_service.core.config import Preset, load_config
+from hmt_service.core.config import load_config
 from hmt_service.core.types import OdometryReading, Reading, Scan
 from hmt_service.runtime.offline import map_readings
 from hmt_service.sim.simulation import INDOOR_LASER, simulate
@@ -30,7 +30,7 @@ def readings() -> list[Reading]:
 def run(readings: list[Reading], tmp_path_factory: pytest.TempPathFactory) -> ChainRun:
     folder = tmp_path_factory.mktemp("chain")
     write_readings(readings, folder / "readings")
-    return run_chain(folder / "readings", Preset.PLANAR, folder, timeout_s=120.0)
+    return run_chain(folder / "readings", load_config(), folder, timeout_s=120.0)
 
 
 def test_readings_come_back_from_the_file(readings: list[Reading], tmp_path: Path) -> None:
@@ -69,7 +69,7 @@ def test_odometry_can_be_withheld(readings: list[Reading], tmp_path: Path) -> No
     write_readings(readings, tmp_path / "readings")
     (tmp_path / "a").mkdir()
     run = run_chain(
-        tmp_path / "readings", Preset.PLANAR, tmp_path / "a", timeout_s=120.0, has_odometry=False
+        tmp_path / "readings", load_config(), tmp_path / "a", timeout_s=120.0, has_odometry=False
     )
     scans = [reading for reading in readings if isinstance(reading, Scan)]
     expected = map_readings(scans, load_config())[0].trajectory()
@@ -81,4 +81,4 @@ def test_odometry_can_be_withheld(readings: list[Reading], tmp_path: Path) -> No
 def test_a_file_that_is_no_readings_is_a_failure(tmp_path: Path) -> None:
     (tmp_path / "readings").write_bytes(b"not an array")
     with pytest.raises(ChildFailed, match="ended with code 1"):
-        run_chain(tmp_path / "readings", Preset.PLANAR, tmp_path, timeout_s=120.0)
+        run_chain(tmp_path / "readings", load_config(), tmp_path, timeout_s=120.0)
