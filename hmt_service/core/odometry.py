@@ -50,6 +50,8 @@ _STAMP_SLACK_S = 1.0
 _KEPT_CELLS, _REGISTERED_CELLS = 0.5, 1.5
 # New space makes a keyframe after this share of the usual motion: never while standing still.
 _LEAST_MOTION_SHARE = 0.2
+# Squared standard deviations by which a scan may move a pose where it says next to nothing.
+_DRAWN2 = 9.0
 # Of so many intervals between scans, the median is what a sweep takes.
 _INTERVALS = 15
 
@@ -78,6 +80,8 @@ class Odometry:
         self._keyframes = 0
         self._keyframe_from_body = certain(identity())
         self._keyframe_error = np.zeros((6, 6))
+        self._drawn, self._allowed = np.zeros(6), np.zeros((6, 6))
+        self._doubt = np.zeros(6)
         self._last_motion = identity()
         self._last_sweep_motion: FloatArray | None = None
         self._last_stamp_s: float | None = None
@@ -244,7 +248,31 @@ class Odometry:
         floor = isotropic_covariance(
             sigma_rad=self._covariance.floor_rad, sigma_m=self._covariance.floor_m
         )
-        return self._confined(GaussianPose(fit.pose, fit.covariance + floor)), fit, None
+        pose = self._undrawn(fit, predicted.mean, motion)
+        return self._confined(GaussianPose(pose, fit.covariance + floor)), fit, None
+
+    def _undrawn(self, fit: Fit, predicted: Pose, motion: GaussianPose) -> Pose:
+        """Return where a scan fits, without what draws it along directions that it does not know.
+
+        Clutter and noise there are better than nothing, and draw a pose to either side. The ends of
+        what a laser of short range sees of a blank wall come along with the robot, and say scan
+        after scan that it stands still: what adds up to more than the prediction allows is not
+        believed, but casts doubt on the prediction.
+        """
+        if not len(fit.degenerate):
+            self._drawn, self._allowed = np.zeros(6), np.zeros((6, 6))
+            return fit.pose
+        correction = log(inverse(predicted) @ fit.pose)
+        along = np.linalg.pinv(fit.degenerate) @ fit.degenerate
+        self._drawn = self._drawn + along @ correction
+        self._allowed = self._allowed + motion.covariance
+        drawn = fit.degenerate @ self._drawn
+        allowed = fit.degenerate @ self._allowed @ fit.degenerate.T
+        if drawn @ np.linalg.solve(allowed, drawn) <= _DRAWN2:
+            return fit.pose
+        self._doubt = self._doubt + along @ correction
+        undrawn: Pose = predicted @ exp(correction - along @ correction)
+        return undrawn
 
     def _failure_of(self, fit: Fit, predicted: GaussianPose) -> TrackingFailure | None:
         config = self._config.odometry
@@ -278,7 +306,8 @@ class Odometry:
         drift = GaussianPose(posed.mean, posed.covariance - ends * noise)
         told = GaussianPose(identity(), self._keyframe_error) @ drift
         error = uneven + noise
-        return self._confined(GaussianPose(told.mean, told.covariance + error)), error
+        doubt = np.outer(self._doubt, self._doubt)
+        return self._confined(GaussianPose(told.mean, told.covariance + error + doubt)), error
 
     def _error_of(self, sweep: Sweep, motion: FloatArray, predicted: FloatArray) -> FloatArray:
         """Return the covariance of a pose because the motion during its sweep was not uniform.
@@ -359,6 +388,7 @@ class Odometry:
         self._keyframes += 1
         self._keyframe_from_body = certain(identity())
         self._keyframe_error = error
+        self._doubt = np.zeros(6)
         self._odometry_at_keyframe = self._odometry
         self._failures = 0
         self._remember(scan, None)
