@@ -96,7 +96,7 @@ def serve(
     )
     save = None
     if out is not None:
-        save = partial(save_results, directory=out, config=settings, seed=seed)
+        save = partial(save_results, directory=out, config=settings, seed=seed, kept=map_file)
     daemon = Daemon(
         DaemonSettings(
             keys=Keys(site, robot),

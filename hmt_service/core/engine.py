@@ -576,7 +576,7 @@ class Engine:
             poses = self._particles.best.keyframe_poses(self._visits)
         return tuple(
             StampedPose(scan.stamp_s, poses[scan.keyframe_index] @ scan.keyframe_from_body)
-            for scan in self._scans
+            for scan in self._scans.scans()
             if scan.keyframe_index < len(poses)
         )
 
@@ -586,10 +586,10 @@ class Engine:
             revision=self._revision,
             seed=self._seed,
             config_json=self._config.model_dump_json(),
-            keyframes=tuple(k for visit in self._visits.values() for k in visit.keyframes),
+            keyframes=self._visits.all_keyframes(),
             visits=stored_visits(self._visits),
             hypotheses=tuple(stored_hypothesis(h) for h in self._particles.hypotheses),
-            scans=tuple(self._scans),
+            scans=self._scans.scans(),
         )
 
     def _choose(self, hypothesis: int | None) -> tuple[Hypothesis, float]:

@@ -10,12 +10,13 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import KDTree
 
+from hmt_service.core.chunked import Chunked
 from hmt_service.core.config import Config
 from hmt_service.core.geometry import (
     PLANAR_AXES,
@@ -102,8 +103,7 @@ class Visits(Mapping[int, Visit]):
 
     def __getitem__(self, visit: int) -> Visit:
         """Return one visit; if it was forgotten, as one that saw nothing."""
-        kept = self._visits[visit]
-        return kept.as_visit() if isinstance(kept, _Path) else kept
+        return _whole(self._visits[visit])
 
     def __iter__(self) -> Iterator[int]:
         """Iterate over the numbers."""
@@ -126,6 +126,13 @@ class Visits(Mapping[int, Visit]):
         kept = self._visits[visit]
         return len(kept.stamps_s if isinstance(kept, _Path) else kept.keyframes)
 
+    def all_keyframes(self) -> Sequence[Keyframe]:
+        """Return the keyframes of all visits as they are now, in time order."""
+        kept = tuple(self._visits)
+        return Chunked(
+            [self.keyframes(visit) for visit in self], lambda visit: _whole(kept[visit]).keyframes
+        )
+
     def is_forgotten(self, visit: int) -> bool:
         """Return whether of a visit only the path is left."""
         return isinstance(self._visits[visit], _Path)
@@ -144,6 +151,10 @@ class Visits(Mapping[int, Visit]):
         if new:
             self._extents = np.concatenate([self._extents, new])
         return self._extents[:count]
+
+
+def _whole(kept: Visit | _Path) -> Visit:
+    return kept.as_visit() if isinstance(kept, _Path) else kept
 
 
 def share_new(visit: Visit, others: Iterable[Visit], poses: FloatArray) -> float:

@@ -201,6 +201,9 @@ class Keeper(Protocol):
     def write(self, engine: Engine) -> None:
         """Write the map: the file holds either the one before or all of this one."""
 
+    def close(self) -> None:
+        """Leave the file at rest."""
+
 
 Save = Callable[["Engine", RunReport], tuple[str, ...]]
 """Writes the results and returns the files' names; picklable, for the topology process runs it."""

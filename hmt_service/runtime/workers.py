@@ -15,6 +15,7 @@ import signal
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from multiprocessing.connection import Connection, wait
 from typing import Any, TypeVar
 
@@ -77,14 +78,15 @@ def run_topology(
     """Turn trackings into the map until the pipes end, and answer requests between two scans."""
     _leave_signals_to_parent()
     topology = _Topology(config, seed, save, keeper)
-    _send(work, Ready())
-    for connection, message in _received(requests, work, idle=topology.rest):
-        if connection is requests:
-            _send(requests, topology.answer(message))
-        elif isinstance(message, Finish):
-            _send(work, topology.finish(message))
-        else:
-            _send(work, topology.map(message))
+    with closing(topology):
+        _send(work, Ready())
+        for connection, message in _received(requests, work, idle=topology.rest):
+            if connection is requests:
+                _send(requests, topology.answer(message))
+            elif isinstance(message, Finish):
+                _send(work, topology.finish(message))
+            else:
+                _send(work, topology.map(message))
 
 
 class _Topology:
@@ -198,6 +200,11 @@ class _Topology:
         snapshot = self._engine.snapshot()
         stamp_s = 0.0 if snapshot is None else snapshot.posterior.stamp_s
         return (Event(EventKind.NOT_SAVED, stamp_s, str(failed), numbers),)
+
+    def close(self) -> None:
+        """Leave the map file at rest."""
+        if self._keeper is not None:
+            self._keeper.close()
 
     def _report(self) -> RunReport:
         return RunReport(self._scans, self._odometry_busy_s, self._busy_s, self._stored_keyframes)

@@ -6,22 +6,28 @@ References:
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hmt_service.core.config import Config
+from hmt_service.io.map_store import MapStore
 
 if TYPE_CHECKING:
     from hmt_service.core.engine import Engine
 
 
-@dataclass(frozen=True, slots=True)
 class KeptMap:
     """One map file that a map goes on in, session after session."""
 
-    path: Path
-    """The file; made when it does not exist."""
+    def __init__(self, path: Path) -> None:
+        """Prepare; nothing is opened.
+
+        Args:
+            path: The file; made when it does not exist.
+        """
+        self.path = path
+        # Where the path is a link, the file that it leads to is written.
+        self._store = MapStore(path)
 
     def engine(self, config: Config, *, seed: int) -> Engine:
         """Return an engine that goes on with the map, or begins it.
@@ -32,22 +38,22 @@ class KeptMap:
 
         Raises:
             InvalidInput: If the file is no map file, is damaged or was written by another version.
+            Unavailable: If it cannot be read now.
         """
         from hmt_service.core.engine import Engine
-        from hmt_service.io.map_file import read_map
 
-        if not self.path.exists():
-            return Engine(config, seed=seed)
-        return Engine.restored(read_map(self.path), seed=seed)
+        stored = self._store.read()
+        return Engine(config, seed=seed) if stored is None else Engine.restored(stored, seed=seed)
 
     def write(self, engine: Engine) -> None:
-        """Write the map, so that the file holds either the one before or all of this one.
+        """Write what is new, so that the file holds either the map before or all of this one.
 
         Raises:
             NotFound: If the folder does not exist.
-            Unavailable: If the file system refuses.
+            Unavailable: If the file system refuses, or another program has written the file.
         """
-        from hmt_service.io.map_file import write_map
+        self._store.update(engine.stored())
 
-        # A link stays one.
-        write_map(self.path.resolve(), engine.stored())
+    def close(self) -> None:
+        """Leave one file, at rest."""
+        self._store.close()

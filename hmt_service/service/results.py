@@ -26,7 +26,13 @@ EVENTS, BELIEFS = "events.jsonl", "posterior.jsonl"
 
 
 def save_results(
-    engine: Engine, report: RunReport, *, directory: Path, config: Config, seed: int
+    engine: Engine,
+    report: RunReport,
+    *,
+    directory: Path,
+    config: Config,
+    seed: int,
+    kept: Path | None = None,
 ) -> tuple[str, ...]:
     """Write trajectory, map, events, beliefs and summary, each replaced as a whole.
 
@@ -36,6 +42,7 @@ def save_results(
         directory: Where to write; made when it does not exist.
         config: Settings that it was built with.
         seed: Seed that it was built with.
+        kept: Map file that has just been written by its owner; the one of the results may be it.
 
     Returns:
         The names of the files.
@@ -76,7 +83,8 @@ def save_results(
     directory.mkdir(parents=True, exist_ok=True)
     trajectory = engine.trajectory()
     _replace(directory / TRAJECTORY, lambda path: write_tum(path, trajectory))
-    write_map(directory / MAP, engine.stored())
+    if kept is None or kept.resolve() != (directory / MAP).resolve():
+        write_map(directory / MAP, engine.stored())
     audit = engine.audit
     _replace(directory / EVENTS, lambda path: write_events(path, audit.events))
     _replace(directory / BELIEFS, lambda path: write_beliefs(path, audit.beliefs))

@@ -83,9 +83,9 @@ def test_scans_come_back_as_they_came() -> None:
     relative = [inverse(PATH[0]) @ pose for pose in PATH]
     for index, pose in enumerate(relative):
         log.append(0.1 * index, 7, pose)
-    scans = list(log)
+    scans = list(log.scans())
     assert [scan.stamp_s for scan in scans] == [0.1 * index for index in range(len(PATH))]
     assert {scan.keyframe_index for scan in scans} == {7}
     for scan, pose in zip(scans, relative, strict=True):
         assert scan.keyframe_from_body == pytest.approx(pose, abs=1e-6)
-    assert list(ScanLog()) == []
+    assert list(ScanLog().scans()) == []

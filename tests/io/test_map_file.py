@@ -24,8 +24,9 @@ from hmt_service.core.stored import (
 from hmt_service.core.types import Keyframe, MapMethod, Points, TrackingFailure
 from hmt_service.errors import InvalidInput, NotFound, Unavailable
 from hmt_service.io.map_check import check_map
-from hmt_service.io.map_file import POINT_RESOLUTION_M, SCHEMA_VERSION, read_map, write_map
+from hmt_service.io.map_file import read_map, write_map
 from hmt_service.io.map_info import map_info
+from hmt_service.io.map_rows import POINT_RESOLUTION_M, SCHEMA_VERSION
 
 
 def random_pose(rng: np.random.Generator) -> Pose:
