@@ -11,7 +11,14 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hmt_service.cli.recorded import print_contents, print_malformed
-from hmt_service.cli.settings import ConfigFile, OwnPreset, Seed, settings_of_map
+from hmt_service.cli.settings import (
+    BudgetSize,
+    ConfigFile,
+    OwnPreset,
+    Seed,
+    budget_of,
+    settings_of_map,
+)
 from hmt_service.errors import NotFound
 
 if TYPE_CHECKING:
@@ -37,10 +44,12 @@ def run(
             "--map", help="Map file to go on with, from an unknown place; it is not changed."
         ),
     ] = None,
+    memory_budget: BudgetSize = None,
 ) -> None:
     """Build the map of a recorded log; the same log and seed give the same files, bit for bit."""
     from rich.console import Console
 
+    from hmt_service.core.engine import Engine
     from hmt_service.io.logs import read_log
     from hmt_service.service.kept_map import KeptMap
     from hmt_service.service.results import save_results
@@ -49,6 +58,7 @@ def run(
     if map_file is not None and not map_file.is_file():
         raise NotFound(f"map file {map_file} does not exist")
     settings = settings_of_map(map_file, preset, config)
+    budget = budget_of(memory_budget)
     with console.status(f"reading {log}"):
         recorded = read_log(
             log,
@@ -56,8 +66,9 @@ def run(
             max_range_m=settings.sensor.max_range_m,
         )
     print_contents(console, recorded)
-    known = None if map_file is None else KeptMap(map_file).engine(settings, seed=seed)
-    engine, report = _map(recorded.readings, recorded.scans, settings, seed, known, console)
+    begin = Engine if map_file is None else KeptMap(map_file).engine
+    engine = begin(settings, seed=seed, budget=budget)
+    report = _map(recorded.readings, recorded.scans, settings, engine, console)
     print_malformed(console, recorded)
     files = save_results(engine, report, directory=out, config=settings, seed=seed)
     _report_map(console, engine, report)
@@ -68,11 +79,10 @@ def _map(
     readings: Iterable[Reading],
     scans: int,
     settings: Config,
-    seed: int,
-    known: Engine | None,
+    engine: Engine,
     console: Console,
-) -> tuple[Engine, RunReport]:
-    """Return the finished engine and what it has cost, with a progress bar meanwhile."""
+) -> RunReport:
+    """Return what finishing the map has cost, with a progress bar meanwhile."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
     from rich.progress import TimeRemainingColumn as Remaining
 
@@ -81,14 +91,14 @@ def _map(
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), Remaining())
     with Progress(*columns, console=console) as progress:
         task = progress.add_task("mapping", total=scans)
-        return map_readings(
+        _, report = map_readings(
             readings,
             settings,
-            seed=seed,
-            known=known,
+            known=engine,
             on_scan=lambda: progress.advance(task),
             on_event=lambda event: _warn(console, event),
         )
+    return report
 
 
 def _warn(console: Console, event: Event) -> None:
@@ -106,10 +116,11 @@ def _report_map(console: Console, engine: Engine, report: RunReport) -> None:
     snapshot = engine.snapshot()
     if snapshot is None:
         return
-    best = snapshot.posterior.hypotheses[0]
+    best, (held_bytes, shelf_bytes) = snapshot.posterior.hypotheses[0], engine.memory_bytes
     console.print(
         f"{best.areas} areas, {snapshot.arcs} arcs, {best.loop_closures} loop closures, "
         f"probability {best.probability:.3f}; {report.scans / report.busy_s:.0f} scans/s "
-        f"(odometry {report.odometry_busy_s:.1f} s, topology {report.topology_busy_s:.1f} s)",
+        f"(odometry {report.odometry_busy_s:.1f} s, topology {report.topology_busy_s:.1f} s); "
+        f"submaps take {held_bytes / 1e6:.1f} MB of memory, {shelf_bytes / 1e6:.1f} MB on the disk",
         soft_wrap=True,
     )

@@ -16,7 +16,14 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hmt_service.cli.connection import Robot, Site
-from hmt_service.cli.settings import ConfigFile, OwnPreset, Seed, settings_of_map
+from hmt_service.cli.settings import (
+    BudgetSize,
+    ConfigFile,
+    OwnPreset,
+    Seed,
+    budget_of,
+    settings_of_map,
+)
 from hmt_service.errors import NotFound
 from hmt_service.service.keys import DEFAULT_ENDPOINT, Keys
 
@@ -65,6 +72,7 @@ def serve(
             "written as the map grows: what `status` calls stored survives anything.",
         ),
     ] = None,
+    memory_budget: BudgetSize = None,
 ) -> None:
     """Build the map of one robot from what it sends, and answer questions about it.
 
@@ -84,6 +92,7 @@ def serve(
     handler = RichHandler(console=console, show_path=False)
     logging.basicConfig(level=logging.INFO, format="%(message)s", handlers=[handler])
     settings = settings_of_map(map_file, preset, config)
+    budget = budget_of(memory_budget)
     if map_file is not None and not map_file.absolute().parent.is_dir():
         raise NotFound(f"folder {map_file.absolute().parent} of the map file does not exist")
     listening = listen or ([] if connect else [DEFAULT_ENDPOINT])
@@ -105,6 +114,7 @@ def serve(
             seed=seed,
             save=save,
             keeper=None if map_file is None else KeptMap(map_file),
+            budget=budget,
             limits=IntakeLimits(reorder_s=reorder_window),
         )
     )

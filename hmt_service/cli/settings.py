@@ -5,13 +5,17 @@ References: own.
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from hmt_service.core.config import Config, Preset, load_config
 from hmt_service.errors import InvalidInput, NotFound
+
+if TYPE_CHECKING:
+    from hmt_service.core.visits import MemoryBudget
 
 PresetName = Annotated[Preset, typer.Option("--preset", help="Kind of sensor.")]
 OwnPreset = Annotated[
@@ -23,6 +27,36 @@ ConfigFile = Annotated[
     typer.Option("--config", help="YAML file of settings that differ from the preset."),
 ]
 Seed = Annotated[int, typer.Option("--seed", min=0, help="Seed of all randomness.")]
+
+
+BudgetSize = Annotated[
+    str | None,
+    typer.Option(
+        "--memory-budget",
+        metavar="SIZE",
+        help="Memory that submaps may take, such as 256MB; those that were not used for the "
+        "longest time are in a temporary file (TMPDIR) meanwhile. The map is the same. All of them "
+        "are in memory if none is given.",
+    ),
+]
+_UNITS = {"KB": 1e3, "MB": 1e6, "GB": 1e9}
+
+
+def budget_of(size: str | None) -> MemoryBudget | None:
+    """Return a memory budget, None for none.
+
+    Raises:
+        InvalidInput: If the text is no size, or too small a one.
+    """
+    if size is None:
+        return None
+    from hmt_service.core.visits import MemoryBudget
+    from hmt_service.io.shelf import DiskShelf
+
+    found = re.fullmatch(r"(\d+(?:\.\d+)?) *([KMG]B)", size.strip().upper())
+    if found is None:
+        raise InvalidInput(f"{size!r} is no size of memory: a number with kB, MB or GB, as 256MB")
+    return MemoryBudget(int(float(found[1]) * _UNITS[found[2]]), DiskShelf())
 
 
 def settings_of_map(map_file: Path | None, preset: Preset | None, config: Path | None) -> Config:

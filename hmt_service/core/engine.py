@@ -64,19 +64,22 @@ from hmt_service.core.types import (
     StampedPose,
     Tracking,
 )
-from hmt_service.core.visits import Visits, share_new
+from hmt_service.core.visits import MemoryBudget, Visits, share_new
 from hmt_service.errors import InvalidInput, NotFound, Unavailable
 
 
 class Engine:
     """Builds the hybrid metric-topological map from tracked scans."""
 
-    def __init__(self, config: Config, *, seed: int = 0) -> None:
+    def __init__(
+        self, config: Config, *, seed: int = 0, budget: MemoryBudget | None = None
+    ) -> None:
         """Start with an empty map.
 
         Args:
             config: Settings of all stages.
             seed: Seed of all randomness.
+            budget: How much of the map may be in memory; None for all of it. The map is the same.
         """
         compile_kernels(config)
         self._config = config
@@ -94,7 +97,7 @@ class Engine:
             rng=rng,
         )
         self._audit = Audit()
-        self._visits = Visits()
+        self._visits = Visits(budget=budget)
         self._motions: list[Factor] = []
         self._scans = ScanLog()
         self._tracked: Counter[str] = Counter()
@@ -106,7 +109,9 @@ class Engine:
         self._first_of_session = 0
 
     @classmethod
-    def restored(cls, stored: StoredMap, *, seed: int = 0) -> Engine:
+    def restored(
+        cls, stored: StoredMap, *, seed: int = 0, budget: MemoryBudget | None = None
+    ) -> Engine:
         """Return an engine that goes on with a stored map, in a new session.
 
         The next tracking is the first of an odometry that knows nothing of the map: the robot may
@@ -115,6 +120,7 @@ class Engine:
         Args:
             stored: The map, with at least one keyframe.
             seed: Seed of all randomness from now on.
+            budget: How much of the map may be in memory; None for all of it.
 
         Raises:
             InvalidInput: If the settings in the map are not of this version, or it is empty.
@@ -123,12 +129,12 @@ class Engine:
         if not stored.hypotheses or not stored.visits:
             held = f"{len(stored.hypotheses)} hypotheses, {len(stored.visits)} visits"
             raise InvalidInput(f"the map is empty: {held}")
-        engine = cls(config, seed=seed)
+        engine = cls(config, seed=seed, budget=budget)
         for keyframe in stored.keyframes:
             engine._observation.learn(keyframe)
         for scan in stored.scans:
             engine._scans.append(scan.stamp_s, scan.keyframe_index, scan.keyframe_from_body)
-        visits = engine._visits = restored_visits(stored, config)
+        visits = engine._visits = restored_visits(stored, config, budget)
         engine._motions = [
             Factor(v, v + 1, visits[v].motion_to(visits[v + 1])) for v in range(len(visits) - 1)
         ]
@@ -430,6 +436,11 @@ class Engine:
     def keyframes(self) -> int:
         """Number of keyframes in the map."""
         return self._open.last_keyframe + 1 if self._visits else 0
+
+    @property
+    def memory_bytes(self) -> tuple[int, int]:
+        """What visits take in memory, and what lies on the shelf."""
+        return self._visits.size_bytes, self._visits.shelf_bytes
 
     @property
     def audit(self) -> Audit:

@@ -19,7 +19,7 @@ from hmt_service.core.stored import (
     StoredVisit,
 )
 from hmt_service.core.submap import visit_of
-from hmt_service.core.visits import Visits
+from hmt_service.core.visits import MemoryBudget, Visits
 
 
 def stored_visits(visits: Visits) -> tuple[StoredVisit, ...]:
@@ -46,9 +46,9 @@ def stored_hypothesis(hypothesis: Hypothesis) -> StoredHypothesis:
     )
 
 
-def restored_visits(stored: StoredMap, config: Config) -> Visits:
+def restored_visits(stored: StoredMap, config: Config, budget: MemoryBudget | None) -> Visits:
     """Return the visits of a stored map; of those that were forgotten, the paths."""
-    visits = Visits()
+    visits = Visits(budget=budget)
     for each in stored.visits:
         keyframes = stored.keyframes[each.first_keyframe : each.last_keyframe + 1]
         visits.put(visit_of(each.visit, keyframes, config))

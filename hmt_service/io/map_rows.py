@@ -27,6 +27,7 @@ import numpy as np
 import zstandard
 
 from hmt_service import __version__
+from hmt_service.core.chunked import Chunked
 from hmt_service.core.geometry import FloatArray, GaussianPose, Pose
 from hmt_service.core.stored import (
     StoredAssignment,
@@ -91,8 +92,8 @@ CREATE TABLE factors (
 
 _Row = tuple[Any, ...]
 _COMPRESSION_LEVEL = 6
-# Keyframes that are in memory together while they are written, and 2**256.
-_TOGETHER = 64
+# Keyframes that are in memory together while they are read or written.
+_TOGETHER = 16
 _MODULUS = 1 << 256
 _FIRST_WITH_SUM = 4
 
@@ -161,8 +162,7 @@ class _Tables:
         self._columns = {table: _columns(database, table) for table in TABLES}
 
     def count(self, table: str) -> int:
-        (count,) = self._database.execute(f"SELECT max(rowid) FROM {table}").fetchone()
-        return int(count or 0)
+        return _count(self._database, table)
 
     def forgotten(self) -> frozenset[int]:
         """Return the visits of which only the path is there."""
@@ -245,6 +245,11 @@ def _row_parts(row: _Row) -> tuple[bytes, bytes]:
     return repr([len(value) for value in values]).encode(), b"".join(values)
 
 
+def _count(database: sqlite3.Connection, table: str) -> int:
+    (last,) = database.execute(f"SELECT max(rowid) FROM {table}").fetchone()
+    return int(last or 0)
+
+
 def _columns(database: sqlite3.Connection, table: str) -> list[str]:
     return [name for _, name, *_ in database.execute(f"PRAGMA table_info({table})")]
 
@@ -290,29 +295,19 @@ def _factor_rows(hypothesis: StoredHypothesis) -> Iterator[_Row]:
         yield hypothesis.hypothesis, f.visit_a, f.visit_b, _gaussian_blob(f.a_from_b)
 
 
-def read_rows(database: sqlite3.Connection, *, with_points: bool) -> StoredMap:
+def read_rows(
+    database: sqlite3.Connection, *, with_points: bool = True, is_lazy: bool = False
+) -> StoredMap:
     """Return the map in the tables.
 
     Args:
         database: Of any version that is read.
         with_points: Whether keyframes come with what they saw, which is most of it.
+        is_lazy: Whether keyframes are read when they are asked for, while the database is open.
     """
     meta = dict(_rows(database, "meta"))
-    resolution_m = float(meta["point_resolution_m"])
-    decompressor = zstandard.ZstdDecompressor()
-    keyframes = tuple(
-        Keyframe(
-            index,
-            stamp_s,
-            _points(points, resolution_m, decompressor) if with_points else NO_POINTS,
-            _numbers(sensor),
-            _gaussian(motion),
-            _numbers(own_error).reshape(6, 6),
-            None if failure is None else TrackingFailure(failure),
-        )
-        for index, stamp_s, sensor, motion, own_error, failure, points in _rows(
-            database, "keyframes"
-        )
+    keyframes = _read_keyframes(
+        database, float(meta["point_resolution_m"]), with_points=with_points
     )
     scans = tuple(
         StoredScan(stamp_s, index, _pose(pose)) for stamp_s, index, pose in _rows(database, "scans")
@@ -322,11 +317,38 @@ def read_rows(database: sqlite3.Connection, *, with_points: bool) -> StoredMap:
         revision=int(meta["revision"]),
         seed=int(meta["seed"]),
         config_json=meta["config"],
-        keyframes=keyframes,
+        keyframes=keyframes if is_lazy else tuple(keyframes),
         visits=_read_visits(database, hypotheses),
         hypotheses=hypotheses,
         scans=scans,
     )
+
+
+def _read_keyframes(
+    database: sqlite3.Connection, resolution_m: float, *, with_points: bool
+) -> Chunked[Keyframe]:
+    decompressor = zstandard.ZstdDecompressor()
+
+    def chunk(number: int) -> tuple[Keyframe, ...]:
+        rows = database.execute(
+            "SELECT * FROM keyframes WHERE rowid > ? AND rowid <= ? ORDER BY rowid",
+            (number * _TOGETHER, (number + 1) * _TOGETHER),
+        )
+        return tuple(
+            Keyframe(
+                index,
+                stamp_s,
+                _points(points, resolution_m, decompressor) if with_points else NO_POINTS,
+                _numbers(sensor),
+                _gaussian(motion),
+                _numbers(own_error).reshape(6, 6),
+                None if failure is None else TrackingFailure(failure),
+            )
+            for index, stamp_s, sensor, motion, own_error, failure, points in rows
+        )
+
+    full, rest = divmod(_count(database, "keyframes"), _TOGETHER)
+    return Chunked([_TOGETHER] * full + [rest], chunk)
 
 
 def _read_visits(

@@ -11,7 +11,8 @@ References:
 from __future__ import annotations
 
 import sqlite3
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from hmt_service.core.stored import StoredMap
@@ -43,8 +44,11 @@ class MapStore:
         self._digest: str | None = None
         self._state: _State | None = None
 
-    def read(self) -> StoredMap | None:
-        """Return the map in the file; None if there is no file.
+    @contextmanager
+    def reading(self) -> Iterator[StoredMap | None]:
+        """Read the map in the file, None if there is no file; its keyframes one after the other.
+
+        They can be asked for until the block ends.
 
         Raises:
             InvalidInput: If it is no map file, is damaged or was written by another version.
@@ -52,12 +56,13 @@ class MapStore:
         """
         self._state = _state_of(self._path)
         if self._state is None:
-            return None
+            yield None
+            return
         with opened(self._path) as database:
             require_sound(database, self._path)
             (version,) = database.execute("PRAGMA user_version").fetchone()
             self._digest = digest_in(database) if version == SCHEMA_VERSION else None
-            return read_rows(database, with_points=True)
+            yield read_rows(database, is_lazy=True)
 
     def update(self, stored: StoredMap) -> None:
         """Bring the file up to a later state of the map that was read from it or written last.

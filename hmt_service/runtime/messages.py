@@ -32,6 +32,7 @@ from hmt_service.errors import HmtError
 
 if TYPE_CHECKING:
     from hmt_service.core.engine import Engine
+    from hmt_service.core.visits import MemoryBudget
 
 
 class ProcessName(StrEnum):
@@ -195,7 +196,7 @@ class Keeper(Protocol):
     def path(self) -> Path:
         """The file."""
 
-    def engine(self, config: Config, *, seed: int) -> Engine:
+    def engine(self, config: Config, *, seed: int, budget: MemoryBudget | None) -> Engine:
         """Return an engine that goes on with the map in the file, or begins one."""
 
     def write(self, engine: Engine) -> None:

@@ -17,7 +17,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from multiprocessing.connection import Connection, wait
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from hmt_service.core.config import Config
 from hmt_service.core.types import Event, EventKind
@@ -40,6 +40,9 @@ from hmt_service.runtime.messages import (
     dump,
     load,
 )
+
+if TYPE_CHECKING:
+    from hmt_service.core.visits import MemoryBudget
 
 _LOG = logging.getLogger(__name__)
 # The map file is written this often, and takes no larger share of the time.
@@ -74,10 +77,11 @@ def run_topology(
     seed: int,
     save: Save | None,
     keeper: Keeper | None,
+    budget: MemoryBudget | None,
 ) -> None:
     """Turn trackings into the map until the pipes end, and answer requests between two scans."""
     _leave_signals_to_parent()
-    topology = _Topology(config, seed, save, keeper)
+    topology = _Topology(config, seed, save, keeper, budget)
     with closing(topology):
         _send(work, Ready())
         for connection, message in _received(requests, work, idle=topology.rest):
@@ -92,12 +96,18 @@ def run_topology(
 class _Topology:
     """The engine, what it has cost, and where it is saved."""
 
-    def __init__(self, config: Config, seed: int, save: Save | None, keeper: Keeper | None) -> None:
+    def __init__(
+        self,
+        config: Config,
+        seed: int,
+        save: Save | None,
+        keeper: Keeper | None,
+        budget: MemoryBudget | None,
+    ) -> None:
         from hmt_service.core.engine import Engine
 
-        self._engine = (
-            Engine(config, seed=seed) if keeper is None else keeper.engine(config, seed=seed)
-        )
+        begin = Engine if keeper is None else keeper.engine
+        self._engine = begin(config, seed=seed, budget=budget)
         self._save = save
         self._keeper = keeper
         self._stored_keyframes = self._engine.keyframes

@@ -14,6 +14,7 @@ from hmt_service.io.map_store import MapStore
 
 if TYPE_CHECKING:
     from hmt_service.core.engine import Engine
+    from hmt_service.core.visits import MemoryBudget
 
 
 class KeptMap:
@@ -29,12 +30,13 @@ class KeptMap:
         # Where the path is a link, the file that it leads to is written.
         self._store = MapStore(path)
 
-    def engine(self, config: Config, *, seed: int) -> Engine:
+    def engine(self, config: Config, *, seed: int, budget: MemoryBudget | None = None) -> Engine:
         """Return an engine that goes on with the map, or begins it.
 
         Args:
             config: Settings of a map that begins; a known map has its own.
             seed: Seed of all randomness.
+            budget: How much of the map may be in memory; None for all of it.
 
         Raises:
             InvalidInput: If the file is no map file, is damaged or was written by another version.
@@ -42,8 +44,10 @@ class KeptMap:
         """
         from hmt_service.core.engine import Engine
 
-        stored = self._store.read()
-        return Engine(config, seed=seed) if stored is None else Engine.restored(stored, seed=seed)
+        with self._store.reading() as stored:
+            if stored is None:
+                return Engine(config, seed=seed, budget=budget)
+            return Engine.restored(stored, seed=seed, budget=budget)
 
     def write(self, engine: Engine) -> None:
         """Write what is new, so that the file holds either the map before or all of this one.

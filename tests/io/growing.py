@@ -45,7 +45,8 @@ def _grow(stored: StoredMap, path: Path) -> None:
     for revision in count(1):
         if revision % _UPDATES == 1:
             store = MapStore(path)
-            store.read()
+            with store.reading():
+                pass
         part = part_of(stored, min(revision, len(stored.keyframes)))
         store.update(replace(part, revision=revision))
         sys.stdout.write(f"{revision}\n")
