@@ -116,11 +116,16 @@ def _report_map(console: Console, engine: Engine, report: RunReport) -> None:
     snapshot = engine.snapshot()
     if snapshot is None:
         return
-    best, (held_bytes, shelf_bytes) = snapshot.posterior.hypotheses[0], engine.memory_bytes
+    best = snapshot.posterior.hypotheses[0]
     console.print(
         f"{best.areas} areas, {snapshot.arcs} arcs, {best.loop_closures} loop closures, "
         f"probability {best.probability:.3f}; {report.scans / report.busy_s:.0f} scans/s "
-        f"(odometry {report.odometry_busy_s:.1f} s, topology {report.topology_busy_s:.1f} s); "
-        f"submaps take {held_bytes / 1e6:.1f} MB of memory, {shelf_bytes / 1e6:.1f} MB on the disk",
+        f"(odometry {report.odometry_busy_s:.1f} s, topology {report.topology_busy_s:.1f} s)",
         soft_wrap=True,
     )
+    if (usage := engine.memory_usage) is not None:
+        console.print(
+            f"submaps take {usage.held_bytes / 1e6:.1f} MB of memory, "
+            f"{usage.shelf_bytes / 1e6:.1f} MB of disk",
+            soft_wrap=True,
+        )

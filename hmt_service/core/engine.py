@@ -64,7 +64,7 @@ from hmt_service.core.types import (
     StampedPose,
     Tracking,
 )
-from hmt_service.core.visits import MemoryBudget, Visits, share_new
+from hmt_service.core.visits import MemoryBudget, MemoryUsage, Visits, share_new
 from hmt_service.errors import InvalidInput, NotFound, Unavailable
 
 
@@ -438,9 +438,9 @@ class Engine:
         return self._open.last_keyframe + 1 if self._visits else 0
 
     @property
-    def memory_bytes(self) -> tuple[int, int]:
-        """What visits take in memory, and what lies on the shelf."""
-        return self._visits.size_bytes, self._visits.shelf_bytes
+    def memory_usage(self) -> MemoryUsage | None:
+        """What submaps take, if there is a budget for them."""
+        return self._visits.usage
 
     @property
     def audit(self) -> Audit:

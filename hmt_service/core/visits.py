@@ -71,6 +71,16 @@ class MemoryBudget:
             )
 
 
+@dataclass(frozen=True, slots=True)
+class MemoryUsage:
+    """How much of a budget is used."""
+
+    held_bytes: int
+    """What visits take in memory."""
+    shelf_bytes: int
+    """What is on the shelf, also of visits that are in memory again."""
+
+
 LEAST_BUDGET_BYTES = 32_000_000
 """The open visit and the candidates that it is compared with."""
 # Surfels and views take several times what the points do: of so many visits they are kept, the last
@@ -244,14 +254,11 @@ class Visits(Mapping[int, Visit]):
         return visit_of(visit, self._budget.shelf.get(visit), kept.config)
 
     @property
-    def size_bytes(self) -> int:
-        """Memory that they take."""
-        return sum(map(footprint_bytes, self._visits))
-
-    @property
-    def shelf_bytes(self) -> int:
-        """What is on the shelf, including visits that are also in memory."""
-        return 0 if self._budget is None else self._budget.shelf.size_bytes
+    def usage(self) -> MemoryUsage | None:
+        """What they take; None without a budget: nobody has counted."""
+        if self._budget is None:
+            return None
+        return MemoryUsage(sum(self._sizes.values()), self._budget.shelf.size_bytes)
 
     def keyframes(self, visit: int) -> int:
         """Return the number of keyframes of a visit."""

@@ -57,7 +57,6 @@ def save_results(
     snapshot = engine.snapshot()
     if snapshot is None:
         raise Unavailable(f"nothing to save: the map has no keyframe after {report.scans} scans")
-    held_bytes, shelf_bytes = engine.memory_bytes
     summary = {
         "version": __version__,
         "config_hash": config.hash(),
@@ -79,9 +78,10 @@ def save_results(
         "tracked": engine.tracked,
         "warnings": [event.message for event in engine.warnings],
         "busy_s": {"odometry": report.odometry_busy_s, "topology": report.topology_busy_s},
-        "submaps_mb": {"memory": held_bytes / 1e6, "disk": shelf_bytes / 1e6},
         "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
     }
+    if (usage := engine.memory_usage) is not None:
+        summary["submaps_mb"] = {"memory": usage.held_bytes / 1e6, "disk": usage.shelf_bytes / 1e6}
     directory.mkdir(parents=True, exist_ok=True)
     trajectory = engine.trajectory()
     _replace(directory / TRAJECTORY, lambda path: write_tum(path, trajectory))

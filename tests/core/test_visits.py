@@ -100,7 +100,8 @@ def test_what_was_used_longest_ago_is_on_the_shelf_and_comes_back() -> None:
     sizes = [footprint_bytes(visit) for visit in whole]
     budget = tiny(sum(sizes) - sizes[1] // 2)
     visits = Visits(whole, budget=budget)
-    assert visits.shelf_bytes > 0
+    assert visits.usage is not None
+    assert visits.usage.shelf_bytes > 0
     # The first one gave way; asked for, it pushes out the next.
     assert visits[0] is not whole[0]
     assert visits[0] is visits[0]
@@ -121,7 +122,8 @@ def test_no_more_than_the_budget_is_in_memory_whatever_is_asked_for() -> None:
         assert len(visits[visit].points)
         assert visits[visit].local_map is not None
         visits.put(visits[7])
-        assert visits.size_bytes <= 4 * largest + footprint_bytes(visits[visit])
+        assert visits.usage is not None
+        assert visits.usage.held_bytes <= 4 * largest + footprint_bytes(visits[visit])
     visits.forget(1)
     assert visits.is_forgotten(1)
     assert not len(visits[1].points)
