@@ -74,7 +74,7 @@ def write_map(path: Path, stored: StoredMap) -> str:
         _settle(path)
         partial.replace(path)
         _sync_folder(path.parent)
-    except (sqlite3.OperationalError, OSError) as error:
+    except (sqlite3.DatabaseError, OSError) as error:
         raise Unavailable(
             f"map of {len(stored.keyframes)} keyframes not written to {path}: {error}"
         ) from error
