@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import resource
 import signal
@@ -176,6 +177,21 @@ def test_a_daemon_that_ends_leaves_one_file_which_may_be_among_its_results(tmp_p
     assert [path.name for path in out.glob("map*")] == ["map.hmt"]
     assert len(read_map(known).keyframes) == keyframes
     assert check_map(known) == ()
+
+
+def test_a_daemon_with_a_memory_budget_begins_a_map_and_goes_on_with_it(tmp_path: Path) -> None:
+    known, out = tmp_path / "known.hmt", tmp_path / "out"
+    for session in range(2):
+        with (
+            running_daemon(out, map_file=known, options=["--memory-budget", "40MB"]) as daemon,
+            daemon.client() as client,
+        ):
+            publish(client, 0, 100, later_s=1e4 * session)
+            wait_until(lambda: client.status().processed_scans == 100)
+            client.save()
+    summary = json.loads((out / "summary.json").read_text())
+    assert 0.0 < summary["submaps_mb"]["memory"] < 40.0
+    assert len(read_map(known).scans) == 200
 
 
 def test_results_that_cannot_be_saved_do_not_keep_the_map_back(tmp_path: Path) -> None:
