@@ -11,7 +11,16 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hmt_service.cli.recorded import print_contents, print_malformed
-from hmt_service.cli.settings import ConfigFile, Frozen, OwnPreset, Seed, kept_map, settings_of_map
+from hmt_service.cli.settings import (
+    BudgetSize,
+    ConfigFile,
+    Frozen,
+    OwnPreset,
+    Seed,
+    budget_of,
+    kept_map,
+    settings_of_map,
+)
 from hmt_service.errors import NotFound
 
 if TYPE_CHECKING:
@@ -38,10 +47,12 @@ def run(
         ),
     ] = None,
     frozen: Frozen = False,
+    memory_budget: BudgetSize = None,
 ) -> None:
     """Build the map of a recorded log; the same log and seed give the same files, bit for bit."""
     from rich.console import Console
 
+    from hmt_service.core.engine import Engine
     from hmt_service.io.logs import read_log
     from hmt_service.service.results import save_results
 
@@ -50,6 +61,7 @@ def run(
         raise NotFound(f"map file {map_file} does not exist")
     kept = kept_map(map_file, is_frozen=frozen)
     settings = settings_of_map(map_file, preset, config)
+    budget = budget_of(memory_budget)
     with console.status(f"reading {log}"):
         recorded = read_log(
             log,
@@ -57,8 +69,9 @@ def run(
             max_range_m=settings.sensor.max_range_m,
         )
     print_contents(console, recorded)
-    known = None if kept is None else kept.engine(settings, seed=seed)
-    engine, report = _map(recorded.readings, recorded.scans, settings, seed, known, console)
+    begin = Engine if kept is None else kept.engine
+    engine = begin(settings, seed=seed, budget=budget)
+    report = _map(recorded.readings, recorded.scans, settings, engine, console)
     print_malformed(console, recorded)
     files = save_results(engine, report, directory=out, config=settings, seed=seed)
     _report_map(console, engine, report)
@@ -69,11 +82,10 @@ def _map(
     readings: Iterable[Reading],
     scans: int,
     settings: Config,
-    seed: int,
-    known: Engine | None,
+    engine: Engine,
     console: Console,
-) -> tuple[Engine, RunReport]:
-    """Return the finished engine and what it has cost, with a progress bar meanwhile."""
+) -> RunReport:
+    """Return what finishing the map has cost, with a progress bar meanwhile."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
     from rich.progress import TimeRemainingColumn as Remaining
 
@@ -82,14 +94,14 @@ def _map(
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), Remaining())
     with Progress(*columns, console=console) as progress:
         task = progress.add_task("mapping", total=scans)
-        return map_readings(
+        _, report = map_readings(
             readings,
             settings,
-            seed=seed,
-            known=known,
+            known=engine,
             on_scan=lambda: progress.advance(task),
             on_event=lambda event: _warn(console, event),
         )
+    return report
 
 
 def _warn(console: Console, event: Event) -> None:
@@ -114,3 +126,9 @@ def _report_map(console: Console, engine: Engine, report: RunReport) -> None:
         f"(odometry {report.odometry_busy_s:.1f} s, topology {report.topology_busy_s:.1f} s)",
         soft_wrap=True,
     )
+    if (usage := engine.memory_usage) is not None:
+        console.print(
+            f"submaps take {usage.held_bytes / 1e6:.1f} MB of memory, "
+            f"{usage.shelf_bytes / 1e6:.1f} MB of disk",
+            soft_wrap=True,
+        )

@@ -16,7 +16,16 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hmt_service.cli.connection import Robot, Site
-from hmt_service.cli.settings import ConfigFile, Frozen, OwnPreset, Seed, kept_map, settings_of_map
+from hmt_service.cli.settings import (
+    BudgetSize,
+    ConfigFile,
+    Frozen,
+    OwnPreset,
+    Seed,
+    budget_of,
+    kept_map,
+    settings_of_map,
+)
 from hmt_service.errors import NotFound
 from hmt_service.service.keys import DEFAULT_ENDPOINT, Keys
 
@@ -66,6 +75,7 @@ def serve(
         ),
     ] = None,
     frozen: Frozen = False,
+    memory_budget: BudgetSize = None,
 ) -> None:
     """Build the map of one robot from what it sends, and answer questions about it.
 
@@ -85,6 +95,7 @@ def serve(
     logging.basicConfig(level=logging.INFO, format="%(message)s", handlers=[handler])
     kept = kept_map(map_file, is_frozen=frozen)
     settings = settings_of_map(map_file, preset, config)
+    budget = budget_of(memory_budget)
     if map_file is not None and not map_file.absolute().parent.is_dir():
         raise NotFound(f"folder {map_file.absolute().parent} of the map file does not exist")
     listening = listen or ([] if connect else [DEFAULT_ENDPOINT])
@@ -97,7 +108,7 @@ def serve(
     )
     save = None
     if out is not None:
-        save = partial(save_results, directory=out, config=settings, seed=seed)
+        save = partial(save_results, directory=out, config=settings, seed=seed, kept=map_file)
     daemon = Daemon(
         DaemonSettings(
             keys=Keys(site, robot),
@@ -106,6 +117,7 @@ def serve(
             seed=seed,
             save=save,
             keeper=kept,
+            budget=budget,
             limits=IntakeLimits(reorder_s=reorder_window),
         )
     )

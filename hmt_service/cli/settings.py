@@ -5,6 +5,7 @@ References: own.
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,6 +15,7 @@ from hmt_service.core.config import Config, Preset, load_config
 from hmt_service.errors import InvalidInput, NotFound
 
 if TYPE_CHECKING:
+    from hmt_service.core.visits import MemoryBudget
     from hmt_service.service.kept_map import KeptMap
 
 PresetName = Annotated[Preset, typer.Option("--preset", help="Kind of sensor.")]
@@ -32,6 +34,36 @@ Frozen = Annotated[
     ),
 ]
 Seed = Annotated[int, typer.Option("--seed", min=0, help="Seed of all randomness.")]
+
+
+BudgetSize = Annotated[
+    str | None,
+    typer.Option(
+        "--memory-budget",
+        metavar="SIZE",
+        help="Memory that submaps may take, such as 256MB; those that were not used for the "
+        "longest time are in a temporary file (TMPDIR) meanwhile. The map is the same. All of them "
+        "are in memory if none is given.",
+    ),
+]
+_UNITS = {"KB": 1e3, "MB": 1e6, "GB": 1e9}
+
+
+def budget_of(size: str | None) -> MemoryBudget | None:
+    """Return a memory budget, None for none.
+
+    Raises:
+        InvalidInput: If the text is no size, or too small a one.
+    """
+    if size is None:
+        return None
+    from hmt_service.core.visits import MemoryBudget
+    from hmt_service.io.shelf import DiskShelf
+
+    found = re.fullmatch(r"(\d+(?:\.\d+)?) *([KMG]B)", size.strip().upper())
+    if found is None:
+        raise InvalidInput(f"{size!r} is no size of memory: a number with kB, MB or GB, as 256MB")
+    return MemoryBudget(int(float(found[1]) * _UNITS[found[2]]), DiskShelf())
 
 
 def settings_of_map(map_file: Path | None, preset: Preset | None, config: Path | None) -> Config:
@@ -66,7 +98,7 @@ def kept_map(map_file: Path | None, *, is_frozen: bool) -> KeptMap | None:
         return None
     if is_frozen and not map_file.is_file():
         raise NotFound(f"map file {map_file} does not exist")
-    return KeptMap(map_file, is_frozen)
+    return KeptMap(map_file, is_frozen=is_frozen)
 
 
 def load_settings(preset: Preset, config: Path | None) -> Config:

@@ -64,19 +64,22 @@ from hmt_service.core.types import (
     StampedPose,
     Tracking,
 )
-from hmt_service.core.visits import Visits, share_new
+from hmt_service.core.visits import MemoryBudget, MemoryUsage, Visits, share_new
 from hmt_service.errors import InvalidInput, NotFound, Unavailable
 
 
 class Engine:
     """Builds the hybrid metric-topological map from tracked scans."""
 
-    def __init__(self, config: Config, *, seed: int = 0) -> None:
+    def __init__(
+        self, config: Config, *, seed: int = 0, budget: MemoryBudget | None = None
+    ) -> None:
         """Start with an empty map.
 
         Args:
             config: Settings of all stages.
             seed: Seed of all randomness.
+            budget: How much of the map may be in memory; None for all of it. The map is the same.
         """
         compile_kernels(config)
         self._config = config
@@ -94,7 +97,7 @@ class Engine:
             rng=rng,
         )
         self._audit = Audit()
-        self._visits = Visits()
+        self._visits = Visits(budget=budget)
         self._motions: list[Factor] = []
         self._scans = ScanLog()
         self._tracked: Counter[str] = Counter()
@@ -107,7 +110,14 @@ class Engine:
         self._frozen_visits = 0
 
     @classmethod
-    def restored(cls, stored: StoredMap, *, seed: int = 0, is_frozen: bool = False) -> Engine:
+    def restored(
+        cls,
+        stored: StoredMap,
+        *,
+        seed: int = 0,
+        is_frozen: bool = False,
+        budget: MemoryBudget | None = None,
+    ) -> Engine:
         """Return an engine that goes on with a stored map, in a new session.
 
         The next tracking is the first of an odometry that knows nothing of the map: the robot may
@@ -118,6 +128,7 @@ class Engine:
             seed: Seed of all randomness from now on.
             is_frozen: Whether the areas stay where and what they are: the session only finds its
                 place in them, and of its visits there only the path is kept.
+            budget: How much of the map may be in memory; None for all of it.
 
         Raises:
             InvalidInput: If the settings in the map are not of this version, or it is empty.
@@ -126,12 +137,12 @@ class Engine:
         if not stored.hypotheses or not stored.visits:
             held = f"{len(stored.hypotheses)} hypotheses, {len(stored.visits)} visits"
             raise InvalidInput(f"the map is empty: {held}")
-        engine = cls(config, seed=seed)
+        engine = cls(config, seed=seed, budget=budget)
         for keyframe in stored.keyframes:
             engine._observation.learn(keyframe)
         for scan in stored.scans:
             engine._scans.append(scan.stamp_s, scan.keyframe_index, scan.keyframe_from_body)
-        visits = engine._visits = restored_visits(stored, config)
+        visits = engine._visits = restored_visits(stored, config, budget)
         engine._motions = [
             Factor(v, v + 1, visits[v].motion_to(visits[v + 1])) for v in range(len(visits) - 1)
         ]
@@ -457,6 +468,11 @@ class Engine:
         return self._open.last_keyframe + 1 if self._visits else 0
 
     @property
+    def memory_usage(self) -> MemoryUsage | None:
+        """What submaps take, if there is a budget for them."""
+        return self._visits.usage
+
+    @property
     def audit(self) -> Audit:
         """What was decided and believed."""
         return self._audit
@@ -608,7 +624,7 @@ class Engine:
             poses = self._particles.best.keyframe_poses(self._visits)
         return tuple(
             StampedPose(scan.stamp_s, poses[scan.keyframe_index] @ scan.keyframe_from_body)
-            for scan in self._scans
+            for scan in self._scans.scans()
             if scan.keyframe_index < len(poses)
         )
 
@@ -618,10 +634,10 @@ class Engine:
             revision=self._revision,
             seed=self._seed,
             config_json=self._config.model_dump_json(),
-            keyframes=tuple(k for visit in self._visits.values() for k in visit.keyframes),
+            keyframes=self._visits.all_keyframes(),
             visits=stored_visits(self._visits),
             hypotheses=tuple(stored_hypothesis(h) for h in self._particles.hypotheses),
-            scans=tuple(self._scans),
+            scans=self._scans.scans(),
         )
 
     def _choose(self, hypothesis: int | None) -> tuple[Hypothesis, float]:

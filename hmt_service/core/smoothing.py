@@ -11,13 +11,15 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from functools import lru_cache
 from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial import KDTree
 
+from hmt_service.core.chunked import Chunked
 from hmt_service.core.config import Config
 from hmt_service.core.geometry import (
     FloatArray,
@@ -34,7 +36,6 @@ from hmt_service.core.geometry import (
 from hmt_service.core.graph import Factor, optimised
 from hmt_service.core.hypotheses import Hypothesis
 from hmt_service.core.local_map import LocalMap, SeenPoints, Sweep
-from hmt_service.core.submap import Visit
 from hmt_service.core.types import Keyframe
 from hmt_service.core.visits import Visits
 
@@ -52,6 +53,8 @@ _LEAST_SHARE = 0.5
 _FLOOR_M, _FLOOR_RAD = 0.005, 0.002
 # Ties so far from where all together put their ends, in squared standard deviations, are left out.
 _GATE = 100.0
+# So many keyframes and windows are kept while ties are looked for.
+_SEEN, _WINDOWS = 128, 64
 
 
 class Smoother:
@@ -78,8 +81,7 @@ class Smoother:
             visits: All visits.
         """
         poses = hypothesis.keyframe_poses(visits)
-        kept = [visits[visit] for visit in visits if not visits.is_forgotten(visit)]
-        smoothed = self._smoothed(hypothesis, kept, poses)
+        smoothed = self._smoothed(hypothesis, visits, poses)
         first_of = np.cumsum([0, *map(visits.keyframes, visits)])
         for visit in filter(visits.is_forgotten, visits):
             founder = first_of[hypothesis.topology.assignments[visit].area]
@@ -88,17 +90,20 @@ class Smoother:
             smoothed[own] = moved @ poses[own]
         return smoothed
 
-    def _smoothed(
-        self, hypothesis: Hypothesis, kept: Sequence[Visit], poses: FloatArray
-    ) -> FloatArray:
+    def _smoothed(self, hypothesis: Hypothesis, visits: Visits, poses: FloatArray) -> FloatArray:
         """Return the poses of all keyframes, those of visits that were kept estimated together."""
-        keyframes = [keyframe for visit in kept for keyframe in visit.keyframes]
+        kept = [visit for visit in visits if not visits.is_forgotten(visit)]
+        sizes = [visits.keyframes(visit) for visit in kept]
+        keyframes = Chunked(sizes, lambda number: visits[kept[number]].keyframes)
         indices = np.array([keyframe.index for keyframe in keyframes])
         ties = self._ties(keyframes, poses[indices])
         smoothed = poses.copy()
         if not ties:
             return smoothed
-        known = [*_motions(hypothesis, kept), *_alignments(hypothesis, kept)]
+        firsts = np.concatenate([[0], np.cumsum(sizes[:-1])]).tolist()
+        first_of = dict(zip(kept, firsts, strict=True))
+        carried = {first_of[v] for v in kept if hypothesis.topology.assignments[v].is_carried}
+        known = [*_motions(keyframes, carried), *_alignments(hypothesis, visits, first_of)]
         solved = poses[indices]
         for _ in range(2):
             solved = optimised(solved, _one_per_pair([*known, *ties]), is_planar=self._is_planar)
@@ -111,25 +116,27 @@ class Smoother:
 
     def _ties(self, keyframes: Sequence[Keyframe], poses: FloatArray) -> list[Factor]:
         """Return what each keyframe says of its pose among those of other times."""
-        seen = [self._seen(keyframe) for keyframe in keyframes]
-        # Of keyframes that saw nothing nothing can be compared.
-        kept = np.array([index for index, each in enumerate(seen) if len(each.points)])
         views = np.full((len(keyframes), 3), np.inf)
-        for index in kept:
-            views[index] = transform_points(poses[index], seen[index].points.mean(axis=0)[None])
+        times = np.empty(len(keyframes), dtype=np.int64)
+        for index, keyframe in enumerate(keyframes):
+            times[index] = keyframe.index
+            points = self._seen(keyframe).points
+            if len(points):
+                views[index] = transform_points(poses[index], points.mean(axis=0)[None])
+        # Of keyframes that saw nothing nothing can be compared.
+        kept = np.flatnonzero(np.isfinite(views[:, 0]))
         tree = KDTree(views[kept])
-        times = np.array([keyframe.index for keyframe in keyframes])
-        windows: dict[int, LocalMap] = {}
+        # Neighbours in time look at the same places: few are needed at once.
+        seen = lru_cache(_SEEN)(lambda index: self._seen(keyframes[index]))
+        windows = lru_cache(_WINDOWS)(lambda middle: self._window(middle, seen, poses, times))
         ties = []
-        for index in kept:
-            sweep = self._sweep(seen[index], keyframes[index])
+        for index in map(int, kept):
+            sweep = self._sweep(seen(index), keyframes[index])
             near = kept[tree.query_ball_point(views[index], _NEAR_M)]
             for other in self._other_times(index, near, views, times):
-                if other not in windows:
-                    windows[other] = self._window(other, seen, poses, times)
-                tie = self._tie(windows[other], sweep, inverse(poses[other]) @ poses[index])
+                tie = self._tie(windows(other), sweep, inverse(poses[other]) @ poses[index])
                 if tie is not None:
-                    ties.append(Factor(other, int(index), tie))
+                    ties.append(Factor(other, index, tie))
         return ties
 
     def _other_times(
@@ -184,7 +191,7 @@ class Smoother:
     def _window(
         self,
         middle: int,
-        seen: Sequence[SeenPoints],
+        seen: Callable[[int], SeenPoints],
         poses: FloatArray,
         times: npt.NDArray[np.int64],
     ) -> LocalMap:
@@ -192,7 +199,7 @@ class Smoother:
         indices = [i for i in around if _is_unbroken(times, i, middle)]
         relative = [inverse(poses[middle]) @ poses[index] for index in indices]
         return LocalMap.of(
-            SeenPoints.together(relative, [seen[index] for index in indices]),
+            SeenPoints.together(relative, [seen(index) for index in indices]),
             self._config,
             sigma_m=self._config.covariance.sigma_m,
         )
@@ -203,34 +210,27 @@ def _is_unbroken(times: npt.NDArray[np.int64], first: int, second: int) -> bool:
     return bool(times[second] - times[first] == second - first)
 
 
-def _motions(hypothesis: Hypothesis, visits: Sequence[Visit]) -> list[Factor]:
-    """Return the motions between neighbours, unless the robot was carried from one to the other.
+def _motions(keyframes: Iterable[Keyframe], carried: Collection[int]) -> list[Factor]:
+    """Return the motions between neighbours, unless the robot was carried to the second.
 
     What is wrong with a keyframe alone is in the motions to and from it; here both have it, as if
     apart: the trajectory then bends a little more freely to the ties, which hold it better.
     """
-    carried = {
-        visit.first_keyframe
-        for visit in visits
-        if hypothesis.topology.assignments[visit.visit].is_carried
-    }
-    keyframes = [keyframe for visit in visits for keyframe in visit.keyframes]
     return [
         Factor(before, before + 1, keyframe.previous_from_body)
         for before, (last, keyframe) in enumerate(pairwise(keyframes))
-        if keyframe.index == last.index + 1 and keyframe.index not in carried
+        if keyframe.index == last.index + 1 and before + 1 not in carried
     ]
 
 
-def _alignments(hypothesis: Hypothesis, visits: Sequence[Visit]) -> list[Factor]:
+def _alignments(
+    hypothesis: Hypothesis, visits: Visits, first_of: Mapping[int, int]
+) -> list[Factor]:
     """Return what ties visits to others than their neighbours, between their first keyframes.
 
     Where the odometry was lost between two visits, nothing else says where the second is.
     """
-    lost = {visit.visit for visit in visits if visit.keyframes[0].failure is not None}
-    sizes = [len(visit.keyframes) for visit in visits]
-    firsts = np.concatenate([[0], np.cumsum(sizes[:-1])]).tolist()
-    first_of = {visit.visit: first for visit, first in zip(visits, firsts, strict=True)}
+    lost = {visit for visit in first_of if visits[visit].keyframes[0].failure is not None}
     return [
         Factor(first_of[factor.visit_a], first_of[factor.visit_b], factor.a_from_b)
         for factor in hypothesis.graph.factors

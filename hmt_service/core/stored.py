@@ -9,16 +9,20 @@ References:
 from __future__ import annotations
 
 from array import array
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from pydantic import ValidationError
 
+from hmt_service.core.chunked import Chunked
 from hmt_service.core.config import Config
 from hmt_service.core.geometry import GaussianPose, Pose, exp, log
 from hmt_service.core.types import Keyframe
 from hmt_service.errors import InvalidInput
+
+# Scans whose poses are computed at once.
+_TOGETHER = 1024
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,6 +35,8 @@ class StoredVisit:
     """Index of the first keyframe, the anchor."""
     last_keyframe: int
     """Index of the last keyframe, included."""
+    is_forgotten: bool = False
+    """Whether of what it has seen nothing is kept."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,6 +49,8 @@ class StoredAssignment:
     """The area."""
     area_from_visit: GaussianPose | None
     """Pose of the visit's anchor inside the area; None: the visit founded the area."""
+    is_carried: bool = False
+    """Whether the robot was carried there: the motion since the visit before says nothing."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,6 +80,12 @@ class StoredHypothesis:
     factors: tuple[StoredFactor, ...]
     """The graph, in the order of their visits."""
 
+    @property
+    def eliminated(self) -> frozenset[int]:
+        """Visits that no arc leads to: what they said is in the arcs of their areas."""
+        tied = {0, *(f.visit_a for f in self.factors), *(f.visit_b for f in self.factors)}
+        return frozenset(self.reference_from_visit) - tied
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StoredScan:
@@ -100,10 +114,16 @@ class ScanLog:
         self._keyframes.append(keyframe_index)
         self._tangents.extend(log(keyframe_from_body))
 
-    def __iter__(self) -> Iterator[StoredScan]:
-        """Iterate over the scans in the order that they came."""
-        poses = exp(np.array(self._tangents, dtype=np.float64).reshape(-1, 6))
-        return map(StoredScan, self._stamps_s, self._keyframes, poses)
+    def scans(self) -> Sequence[StoredScan]:
+        """Return the scans so far, in the order that they came."""
+        full, rest = divmod(len(self._stamps_s), _TOGETHER)
+        return Chunked([_TOGETHER] * full + [rest], self._chunk)
+
+    def _chunk(self, chunk: int) -> list[StoredScan]:
+        part = slice(chunk * _TOGETHER, (chunk + 1) * _TOGETHER)
+        tangents = self._tangents[6 * part.start : 6 * part.stop]
+        poses = exp(np.array(tangents, dtype=np.float64).reshape(-1, 6))
+        return list(map(StoredScan, self._stamps_s[part], self._keyframes[part], poses))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -116,13 +136,13 @@ class StoredMap:
     """Seed of the random generator of the run."""
     config_json: str
     """All settings, as `Config.model_dump_json` writes them."""
-    keyframes: tuple[Keyframe, ...]
+    keyframes: Sequence[Keyframe]
     """In the order of their indices."""
     visits: tuple[StoredVisit, ...]
     """In the order that they were made."""
     hypotheses: tuple[StoredHypothesis, ...]
     """All hypotheses that are alive, in the engine's order."""
-    scans: tuple[StoredScan, ...]
+    scans: Sequence[StoredScan]
     """In the order that they came."""
 
     @property

@@ -6,7 +6,7 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from itertools import accumulate, pairwise
 
 from hmt_service.core.config import Config
 from hmt_service.core.graph import Factor, PoseGraph
@@ -18,15 +18,16 @@ from hmt_service.core.stored import (
     StoredMap,
     StoredVisit,
 )
-from hmt_service.core.submap import Visit, visit_of
-from hmt_service.core.visits import Visits
+from hmt_service.core.submap import visit_of
+from hmt_service.core.visits import MemoryBudget, Visits
 
 
-def stored_visits(visits: Mapping[int, Visit]) -> tuple[StoredVisit, ...]:
+def stored_visits(visits: Visits) -> tuple[StoredVisit, ...]:
     """Return what is stored of the visits but their keyframes."""
+    ends = list(accumulate(map(visits.keyframes, visits), initial=0))
     return tuple(
-        StoredVisit(visit.visit, visit.first_keyframe, visit.last_keyframe)
-        for visit in visits.values()
+        StoredVisit(visit, first, end - 1, visits.is_forgotten(visit))
+        for visit, (first, end) in enumerate(pairwise(ends))
     )
 
 
@@ -37,7 +38,7 @@ def stored_hypothesis(hypothesis: Hypothesis) -> StoredHypothesis:
         hypothesis=hypothesis.hypothesis,
         log_weight=hypothesis.log_weight,
         assignments=tuple(
-            StoredAssignment(a.visit, a.area, a.area_from_visit)
+            StoredAssignment(a.visit, a.area, a.area_from_visit, a.is_carried)
             for a in hypothesis.topology.assignments
         ),
         reference_from_visit={visit: graph.pose(visit) for visit in graph.visits},
@@ -45,14 +46,13 @@ def stored_hypothesis(hypothesis: Hypothesis) -> StoredHypothesis:
     )
 
 
-def restored_visits(stored: StoredMap, config: Config) -> Visits:
+def restored_visits(stored: StoredMap, config: Config, budget: MemoryBudget | None) -> Visits:
     """Return the visits of a stored map; of those that were forgotten, the paths."""
-    visits = Visits()
-    forgotten = _eliminated(stored.hypotheses[0])
+    visits = Visits(budget=budget)
     for each in stored.visits:
         keyframes = stored.keyframes[each.first_keyframe : each.last_keyframe + 1]
         visits.put(visit_of(each.visit, keyframes, config))
-        if each.visit in forgotten:
+        if each.is_forgotten:
             visits.forget(each.visit)
     return visits
 
@@ -71,16 +71,12 @@ def restored_hypothesis(
     graph = PoseGraph.restored(
         stored.reference_from_visit,
         [Factor(f.visit_a, f.visit_b, f.a_from_b) for f in stored.factors],
-        {visit: area_of[visit] for visit in sorted(_eliminated(stored))},
+        {visit: area_of[visit] for visit in sorted(stored.eliminated)},
         is_planar=is_planar,
     )
     if is_frozen:
         graph = graph.frozen(area_of)
-    assignments = tuple(Assignment(a.visit, a.area, a.area_from_visit) for a in stored.assignments)
+    assignments = tuple(
+        Assignment(a.visit, a.area, a.area_from_visit, a.is_carried) for a in stored.assignments
+    )
     return Hypothesis(stored.hypothesis, stored.log_weight, Topology(assignments), graph)
-
-
-def _eliminated(stored: StoredHypothesis) -> set[int]:
-    """Return the visits that no arc leads to: what they said is in the arcs of their areas."""
-    tied = {0, *(f.visit_a for f in stored.factors), *(f.visit_b for f in stored.factors)}
-    return set(stored.reference_from_visit) - tied

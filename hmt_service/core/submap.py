@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -38,9 +38,6 @@ from hmt_service.core.types import Keyframe, Points
 
 # Size of the cells that a submap keeps one point of, over those of the local map.
 _SUBMAP_CELLS = 0.5
-# Surfels and views take several times what the points do: of so many visits they are kept, the last
-# used.
-_LOCAL_MAPS = 24
 _NO_CELLS: Cells = np.zeros(0, dtype=np.int64)
 
 
@@ -170,15 +167,22 @@ class Visit:
         poses = self.visit_from_keyframe
         return np.array([p.mean[:3, 3] for p in poses]), np.array([p.sigma_m for p in poses])
 
-    @property
+    @cached_property
     def local_map(self) -> LocalMap:
         """The submap, ready to register others in it."""
-        return _local_map_of(self)
+        return LocalMap.of(self.seen, self.config, sigma_m=self.config.covariance.sigma_submap_m)
 
-    @property
+    @cached_property
     def view(self) -> View:
         """The submap seen from above, ready to be searched for others."""
-        return _view_of(self)
+        return View.of(
+            self.seen.points, self.seen.directions, cell_m=self.config.alignment.raster_m
+        )
+
+    def rest(self) -> None:
+        """Drop what takes several times the memory that the points do; it is made again."""
+        for name in ("local_map", "view"):
+            vars(self).pop(name, None)
 
     @cached_property
     def bend(self) -> FloatArray:
@@ -242,17 +246,6 @@ class Visit:
     def motion_to(self, following: Visit) -> GaussianPose:
         """Return the motion from this visit's frame to that of the visit just after it."""
         return _chained(self.visit_from_keyframe[-1], self.keyframes[-1], following.keyframes[0])
-
-
-@lru_cache(maxsize=_LOCAL_MAPS)
-def _view_of(visit: Visit) -> View:
-    seen, cell_m = visit.seen, visit.config.alignment.raster_m
-    return View.of(seen.points, seen.directions, cell_m=cell_m)
-
-
-@lru_cache(maxsize=_LOCAL_MAPS)
-def _local_map_of(visit: Visit) -> LocalMap:
-    return LocalMap.of(visit.seen, visit.config, sigma_m=visit.config.covariance.sigma_submap_m)
 
 
 def _chained(visit_from_last: GaussianPose, last: Keyframe, new: Keyframe) -> GaussianPose:

@@ -2,7 +2,8 @@
 
 What a robot sees again and again need not be kept again and again. The visits that founded areas,
 and some more to each, keep their scans; of a later one that shows nothing new only the path stays,
-and what it says of the areas around it is in their arcs.
+and what it says of the areas around it is in their arcs. Where memory has a budget, the visits used
+longest ago are put on a shelf, and taken from it when they are needed.
 
 References:
     Blanco et al. 2008, sections IV-D and V (the memory must not grow with the length of the path).
@@ -10,13 +11,16 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from scipy.spatial import KDTree
 
+from hmt_service.core.chunked import Chunked
 from hmt_service.core.config import Config
+from hmt_service.core.footprint import footprint_bytes
 from hmt_service.core.geometry import (
     PLANAR_AXES,
     FloatArray,
@@ -28,6 +32,60 @@ from hmt_service.core.geometry import (
 )
 from hmt_service.core.submap import Visit, visit_of
 from hmt_service.core.types import NO_POINTS, Keyframe, TrackingFailure
+from hmt_service.errors import InvalidInput
+
+
+class Shelf(Protocol):
+    """Where the keyframes of visits are that memory has no room for."""
+
+    @property
+    def size_bytes(self) -> int:
+        """What lies there."""
+
+    def put(self, visit: int, keyframes: Sequence[Keyframe]) -> None:
+        """Keep the keyframes of a visit."""
+
+    def get(self, visit: int) -> tuple[Keyframe, ...]:
+        """Return them, the same in every bit."""
+
+
+@dataclass(frozen=True, slots=True)
+class MemoryBudget:
+    """How much of the map may be in memory."""
+
+    size_bytes: int
+    """What visits may take; those in use at the moment are there even if they take more."""
+    shelf: Shelf
+    """Where the others are."""
+
+    def __post_init__(self) -> None:
+        """Refuse a budget that what is always in use would not fit into.
+
+        Raises:
+            InvalidInput: If it is below `LEAST_BUDGET_BYTES`.
+        """
+        if self.size_bytes < LEAST_BUDGET_BYTES:
+            raise InvalidInput(
+                f"a memory budget of {self.size_bytes / 1e6:g} MB is too small: the areas that the "
+                f"robot is among take {LEAST_BUDGET_BYTES / 1e6:g} MB"
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class MemoryUsage:
+    """How much of a budget is used."""
+
+    held_bytes: int
+    """What visits take in memory."""
+    shelf_bytes: int
+    """What is on the shelf, also of visits that are in memory again."""
+
+
+LEAST_BUDGET_BYTES = 32_000_000
+"""The open visit and the candidates that it is compared with."""
+# Surfels and views take several times what the points do: of so many visits they are kept, the last
+# used.
+_READY = 24
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,6 +141,15 @@ class _Path:
         )
 
 
+@dataclass(frozen=True, slots=True)
+class _Shelved:
+    """What stays in memory of a visit on the shelf."""
+
+    keyframes: int
+    last_stamp_s: float
+    config: Config
+
+
 def _upper(config: Config) -> tuple[np.ndarray, np.ndarray]:
     """Return the places of what a covariance consists of."""
     axes = PLANAR_AXES if config.sensor.is_planar else np.arange(6)
@@ -93,17 +160,36 @@ def _upper(config: Config) -> tuple[np.ndarray, np.ndarray]:
 class Visits(Mapping[int, Visit]):
     """All visits by their numbers, in time order, and where each lies in its own frame."""
 
-    def __init__(self, visits: Iterable[Visit] = ()) -> None:
-        """Take some visits, numbered from 0."""
-        self._visits: list[Visit | _Path] = []
+    def __init__(self, visits: Iterable[Visit] = (), *, budget: MemoryBudget | None = None) -> None:
+        """Take some visits, numbered from 0.
+
+        Args:
+            visits: The visits.
+            budget: How many may be in memory; None for all of them.
+        """
+        self._visits: list[Visit | _Path | _Shelved] = []
         self._extents = np.zeros((0, 5))
+        self._budget = budget
+        # Size of what is in memory, the last used last; what was used since may have grown.
+        self._sizes: dict[int, int] = {}
+        self._used = set[int]()
+        self._on_shelf = set[int]()
+        self._ready: dict[int, Visit] = {}
         for visit in visits:
             self.put(visit)
 
     def __getitem__(self, visit: int) -> Visit:
         """Return one visit; if it was forgotten, as one that saw nothing."""
         kept = self._visits[visit]
-        return kept.as_visit() if isinstance(kept, _Path) else kept
+        if isinstance(kept, _Path):
+            return kept.as_visit()
+        if isinstance(kept, _Shelved):
+            kept = self._visits[visit] = self._taken(visit, kept)
+            self._use(kept)
+            self._make_room()
+        else:
+            self._use(kept)
+        return kept
 
     def __iter__(self) -> Iterator[int]:
         """Iterate over the numbers."""
@@ -120,16 +206,88 @@ class Visits(Mapping[int, Visit]):
         else:
             self._visits[visit.visit] = visit
             self._extents = self._extents[: visit.visit]
+        self._use(visit)
+        self._make_room()
+
+    def _use(self, visit: Visit) -> None:
+        """Note that a visit is the last used one."""
+        self._ready.pop(visit.visit, None)
+        self._ready[visit.visit] = visit
+        if len(self._ready) > _READY:
+            self._ready.pop(next(iter(self._ready))).rest()
+        if self._budget is not None:
+            self._sizes[visit.visit] = self._sizes.pop(visit.visit, 0)
+            self._used.add(visit.visit)
+
+    def _make_room(self) -> None:
+        """Put what was not used for the longest time on the shelf, but for the last two visits."""
+        if self._budget is None:
+            return
+        for visit in self._used:
+            self._sizes[visit] = footprint_bytes(self._visits[visit])
+        total, last = sum(self._sizes.values()), next(reversed(self._sizes))
+        self._used = {last}
+        for visit in list(self._sizes):
+            if total <= self._budget.size_bytes:
+                return
+            if visit != last and visit < len(self._visits) - 2:
+                total -= self._sizes[visit]
+                self._put_away(visit)
+
+    def _put_away(self, visit: int) -> None:
+        kept = self._visits[visit]
+        assert isinstance(kept, Visit), "what is on the shelf or forgotten has no size"
+        assert self._budget is not None, "without a budget there is room"
+        if visit not in self._on_shelf:
+            self._budget.shelf.put(visit, kept.keyframes)
+            self._on_shelf.add(visit)
+        last_stamp_s = kept.keyframes[-1].stamp_s
+        self._visits[visit] = _Shelved(len(kept.keyframes), last_stamp_s, kept.config)
+        self._drop(visit)
+
+    def _drop(self, visit: int) -> None:
+        """Have nothing of a visit in memory but what is in its place."""
+        self._sizes.pop(visit, None)
+        self._used.discard(visit)
+        self._ready.pop(visit, None)
+
+    def _taken(self, visit: int, kept: _Shelved) -> Visit:
+        assert self._budget is not None, "without a budget nothing is put away"
+        return visit_of(visit, self._budget.shelf.get(visit), kept.config)
+
+    @property
+    def usage(self) -> MemoryUsage | None:
+        """What they take; None without a budget: nobody has counted."""
+        if self._budget is None:
+            return None
+        return MemoryUsage(sum(self._sizes.values()), self._budget.shelf.size_bytes)
 
     def keyframes(self, visit: int) -> int:
         """Return the number of keyframes of a visit."""
         kept = self._visits[visit]
-        return len(kept.stamps_s if isinstance(kept, _Path) else kept.keyframes)
+        if isinstance(kept, _Path):
+            return len(kept.stamps_s)
+        return kept.keyframes if isinstance(kept, _Shelved) else len(kept.keyframes)
+
+    def all_keyframes(self) -> Sequence[Keyframe]:
+        """Return the keyframes of all visits as they are now, in time order."""
+        kept = tuple(self._visits)
+
+        def of(visit: int) -> Sequence[Keyframe]:
+            now = kept[visit]
+            if isinstance(now, _Shelved):
+                assert self._budget is not None, "without a budget nothing is put away"
+                return self._budget.shelf.get(visit)
+            return now.as_visit().keyframes if isinstance(now, _Path) else now.keyframes
+
+        return Chunked([self.keyframes(visit) for visit in self], of)
 
     def last_stamp_s(self, visit: int) -> float:
         """Return the sensor time of the last keyframe of a visit."""
         kept = self._visits[visit]
-        return float(kept.stamps_s[-1] if isinstance(kept, _Path) else kept.keyframes[-1].stamp_s)
+        if isinstance(kept, _Path):
+            return float(kept.stamps_s[-1])
+        return kept.last_stamp_s if isinstance(kept, _Shelved) else kept.keyframes[-1].stamp_s
 
     def is_forgotten(self, visit: int) -> bool:
         """Return whether of a visit only the path is left."""
@@ -139,6 +297,7 @@ class Visits(Mapping[int, Visit]):
         """Keep the path of a visit only."""
         self.extents(visit + 1)
         self._visits[visit] = _Path.of(self[visit])
+        self._drop(visit)
 
     def extents(self, count: int) -> FloatArray:
         """Return centre, radius and reach of the first so many visits, shape (count, 5), m."""

@@ -22,7 +22,8 @@ from pydantic import ValidationError
 from hmt_service.core.config import Config
 from hmt_service.core.geometry import FloatArray
 from hmt_service.core.types import TrackingFailure
-from hmt_service.io.map_file import DIGEST, TABLES, content_digest, opened
+from hmt_service.io.map_file import opened
+from hmt_service.io.map_rows import DIGEST, TABLES, content_digest
 
 # What is stored in single precision is no rotation, and no covariance, to the last digit.
 _ROTATION_TOLERANCE = 1e-5
@@ -267,6 +268,8 @@ def _extents(visits: Sequence[_Row], keyframes: int) -> Iterator[str]:
                 f"visits, visit {row['visit']}: keyframes {first} to {last}, "
                 f"the one before ends at {expected - 1}"
             )
+        if row.get("is_forgotten", 0) not in (0, 1):
+            yield f"visits, visit {row['visit']}: is_forgotten is {row['is_forgotten']}, not 0 or 1"
         expected = last + 1
     if visits and expected != keyframes:
         yield f"visits: the last one ends at keyframe {expected - 1} of 0 to {keyframes - 1}"

@@ -17,7 +17,8 @@ import zstandard
 
 from hmt_service.core.config import Preset, load_config
 from hmt_service.core.stored import StoredHypothesis
-from hmt_service.io.map_file import opened, read_map
+from hmt_service.io.map_file import opened
+from hmt_service.io.map_rows import read_rows
 from hmt_service.io.placed_map import PlacedMap
 
 _POINT_BYTES = 12
@@ -87,14 +88,16 @@ def map_info(path: Path) -> MapInfo:
     Raises:
         NotFound: If there is no such file.
         InvalidInput: If it is no map file, is damaged or was written by another version.
+        Unavailable: If it cannot be read now.
     """
-    placed = PlacedMap.of(read_map(path, with_points=False))
-    stored, config = placed.stored, placed.config
     with opened(path) as database:
+        stored = read_rows(database, with_points=False)
         meta = dict(database.execute("SELECT key, value FROM meta"))
         (version,) = database.execute("PRAGMA user_version").fetchone()
         points = _points(database)
         created_by, resolution_m = meta["created_by"], float(meta["point_resolution_m"])
+    placed = PlacedMap.of(stored)
+    config = placed.config
     stamps_s = [scan.stamp_s for scan in stored.scans]
     positions = np.array([pose.reference_from_body[:3, 3] for pose in placed.trajectory()])
     steps_m = np.linalg.norm(np.diff(positions.reshape(-1, 3), axis=0), axis=1)

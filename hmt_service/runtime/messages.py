@@ -32,6 +32,7 @@ from hmt_service.errors import HmtError
 
 if TYPE_CHECKING:
     from hmt_service.core.engine import Engine
+    from hmt_service.core.visits import MemoryBudget
 
 
 class ProcessName(StrEnum):
@@ -202,11 +203,14 @@ class Keeper(Protocol):
     def is_frozen(self) -> bool:
         """Whether it is only read."""
 
-    def engine(self, config: Config, *, seed: int) -> Engine:
+    def engine(self, config: Config, *, seed: int, budget: MemoryBudget | None) -> Engine:
         """Return an engine that goes on with the map in the file, or begins one."""
 
     def write(self, engine: Engine) -> None:
         """Write the map: the file holds either the one before or all of this one."""
+
+    def close(self) -> None:
+        """Leave the file at rest."""
 
 
 Save = Callable[["Engine", RunReport], tuple[str, ...]]

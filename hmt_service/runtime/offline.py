@@ -30,8 +30,8 @@ def map_readings(
     Args:
         readings: In the order of time.
         config: Settings of all stages.
-        seed: Seed of all randomness.
-        known: Engine of a map to go on with, of these settings; None to begin one.
+        seed: Seed of all randomness of one that begins.
+        known: Engine to go on with, of these settings; None to begin one.
         on_scan: Called after each scan.
         on_event: Called with everything that happens to the map, before `on_scan`.
     """

@@ -22,7 +22,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing.connection import wait
 from multiprocessing.context import SpawnProcess
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from hmt_service.core.config import Config
 from hmt_service.core.types import Reading, Tracking
@@ -43,6 +43,9 @@ from hmt_service.runtime.messages import (
     dump,
 )
 from hmt_service.runtime.workers import run_odometry, run_topology
+
+if TYPE_CHECKING:
+    from hmt_service.core.visits import MemoryBudget
 
 _READINGS_BYTES = 4_000_000
 """Readings that wait for the odometry here; the rest wait, still encoded, at the input."""
@@ -81,6 +84,7 @@ class Pipeline:
         seed: int = 0,
         save: Save | None = None,
         keeper: Keeper | None = None,
+        budget: MemoryBudget | None = None,
     ) -> None:
         """Prepare; `start` starts.
 
@@ -91,11 +95,13 @@ class Pipeline:
                 None for never.
             keeper: Reads the map that the topology process goes on with, and writes it as it grows;
                 None for none.
+            budget: How much of the map the topology process may have in memory; None for all.
         """
         self._config = config
         self._seed = seed
         self._save = save
         self._keeper = keeper
+        self._budget = budget
         self._progress = Tracked(None, 0, 0.0)
         self._tracked_scans = 0
         self._report = RunReport(0, 0.0, 0.0)
@@ -122,6 +128,7 @@ class Pipeline:
                     self._seed,
                     self._save,
                     self._keeper,
+                    self._budget,
                 ),
                 name="hmt-topology",
             ),

@@ -15,8 +15,9 @@ import signal
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from multiprocessing.connection import Connection, wait
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from hmt_service.core.config import Config
 from hmt_service.core.types import Event, EventKind
@@ -39,6 +40,9 @@ from hmt_service.runtime.messages import (
     dump,
     load,
 )
+
+if TYPE_CHECKING:
+    from hmt_service.core.visits import MemoryBudget
 
 _LOG = logging.getLogger(__name__)
 # The map file is written this often, and takes no larger share of the time.
@@ -73,29 +77,37 @@ def run_topology(
     seed: int,
     save: Save | None,
     keeper: Keeper | None,
+    budget: MemoryBudget | None,
 ) -> None:
     """Turn trackings into the map until the pipes end, and answer requests between two scans."""
     _leave_signals_to_parent()
-    topology = _Topology(config, seed, save, keeper)
-    _send(work, Ready(topology.known()))
-    for connection, message in _received(requests, work, idle=topology.rest):
-        if connection is requests:
-            _send(requests, topology.answer(message))
-        elif isinstance(message, Finish):
-            _send(work, topology.finish(message))
-        else:
-            _send(work, topology.map(message))
+    topology = _Topology(config, seed, save, keeper, budget)
+    with closing(topology):
+        _send(work, Ready(topology.known()))
+        for connection, message in _received(requests, work, idle=topology.rest):
+            if connection is requests:
+                _send(requests, topology.answer(message))
+            elif isinstance(message, Finish):
+                _send(work, topology.finish(message))
+            else:
+                _send(work, topology.map(message))
 
 
 class _Topology:
     """The engine, what it has cost, and where it is saved."""
 
-    def __init__(self, config: Config, seed: int, save: Save | None, keeper: Keeper | None) -> None:
+    def __init__(
+        self,
+        config: Config,
+        seed: int,
+        save: Save | None,
+        keeper: Keeper | None,
+        budget: MemoryBudget | None,
+    ) -> None:
         from hmt_service.core.engine import Engine
 
-        self._engine = (
-            Engine(config, seed=seed) if keeper is None else keeper.engine(config, seed=seed)
-        )
+        begin = Engine if keeper is None else keeper.engine
+        self._engine = begin(config, seed=seed, budget=budget)
         self._save = save
         self._keeper = None if keeper is None or keeper.is_frozen else keeper
         self._stored_keyframes = self._engine.keyframes
@@ -203,6 +215,11 @@ class _Topology:
         snapshot = self._engine.snapshot()
         stamp_s = 0.0 if snapshot is None else snapshot.posterior.stamp_s
         return (Event(EventKind.NOT_SAVED, stamp_s, str(failed), numbers),)
+
+    def close(self) -> None:
+        """Leave the map file at rest."""
+        if self._keeper is not None:
+            self._keeper.close()
 
     def _report(self) -> RunReport:
         return RunReport(self._scans, self._odometry_busy_s, self._busy_s, self._stored_keyframes)

@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import Future, wait
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import zenoh
 
@@ -23,6 +24,9 @@ from hmt_service.service.intake import IntakeLimits
 from hmt_service.service.keys import Keys
 from hmt_service.service.reports import Status
 from hmt_service.service.session import Endpoints, open_session
+
+if TYPE_CHECKING:
+    from hmt_service.core.visits import MemoryBudget
 
 _TICK_S = 0.1
 _POLL_S = 0.02
@@ -50,6 +54,8 @@ class DaemonSettings:
     """Writes the results, in the topology process; None for never."""
     keeper: Keeper | None = None
     """Owner of the map file that the map goes on in; None for none."""
+    budget: MemoryBudget | None = None
+    """How much of the map may be in memory; None for all of it."""
     limits: IntakeLimits = field(default_factory=IntakeLimits)
     """What may wait at the input."""
 
@@ -104,7 +110,11 @@ class Daemon:
         with open_session(settings.endpoints) as session:
             _refuse_second(session, settings.keys)
             pipeline = Pipeline(
-                settings.config, seed=settings.seed, save=settings.save, keeper=settings.keeper
+                settings.config,
+                seed=settings.seed,
+                save=settings.save,
+                keeper=settings.keeper,
+                budget=settings.budget,
             )
             gateway = Gateway(
                 session,

@@ -6,51 +6,64 @@ References:
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hmt_service.core.config import Config
+from hmt_service.errors import NotFound
+from hmt_service.io.map_store import MapStore
 
 if TYPE_CHECKING:
     from hmt_service.core.engine import Engine
+    from hmt_service.core.visits import MemoryBudget
 
 
-@dataclass(frozen=True, slots=True)
 class KeptMap:
     """One map file that a map goes on in, session after session."""
 
-    path: Path
-    """The file; made when it does not exist."""
-    is_frozen: bool = False
-    """Whether it stays as it is: a session only finds its place in it."""
+    def __init__(self, path: Path, *, is_frozen: bool = False) -> None:
+        """Prepare; nothing is opened.
 
-    def engine(self, config: Config, *, seed: int) -> Engine:
+        Args:
+            path: The file; made when it does not exist.
+            is_frozen: Whether it stays as it is: a session only finds its place in it.
+        """
+        self.path = path
+        self.is_frozen = is_frozen
+        # Where the path is a link, the file that it leads to is written.
+        self._store = MapStore(path)
+
+    def engine(self, config: Config, *, seed: int, budget: MemoryBudget | None = None) -> Engine:
         """Return an engine that goes on with the map, or begins it.
 
         Args:
             config: Settings of a map that begins; a known map has its own.
             seed: Seed of all randomness.
+            budget: How much of the map may be in memory; None for all of it.
 
         Raises:
             NotFound: If the map is frozen, and there is none.
             InvalidInput: If the file is no map file, is damaged or was written by another version.
+            Unavailable: If it cannot be read now.
         """
         from hmt_service.core.engine import Engine
-        from hmt_service.io.map_file import read_map
 
-        if not self.path.exists() and not self.is_frozen:
-            return Engine(config, seed=seed)
-        return Engine.restored(read_map(self.path), seed=seed, is_frozen=self.is_frozen)
+        with self._store.reading() as stored:
+            if stored is not None:
+                return Engine.restored(stored, seed=seed, is_frozen=self.is_frozen, budget=budget)
+            if self.is_frozen:
+                raise NotFound(f"map file {self.path} does not exist")
+            return Engine(config, seed=seed, budget=budget)
 
     def write(self, engine: Engine) -> None:
-        """Write the map, so that the file holds either the one before or all of this one.
+        """Write what is new, so that the file holds either the map before or all of this one.
 
         Raises:
             NotFound: If the folder does not exist.
-            Unavailable: If the file system refuses.
+            Unavailable: If the file system refuses, or another program has written the file.
         """
-        from hmt_service.io.map_file import write_map
+        self._store.update(engine.stored())
 
-        # A link stays one.
-        write_map(self.path.resolve(), engine.stored())
+    def close(self) -> None:
+        """Leave one file, at rest."""
+        self._store.close()

@@ -26,7 +26,13 @@ EVENTS, BELIEFS = "events.jsonl", "posterior.jsonl"
 
 
 def save_results(
-    engine: Engine, report: RunReport, *, directory: Path, config: Config, seed: int
+    engine: Engine,
+    report: RunReport,
+    *,
+    directory: Path,
+    config: Config,
+    seed: int,
+    kept: Path | None = None,
 ) -> tuple[str, ...]:
     """Write trajectory, map, events, beliefs and summary, each replaced as a whole.
 
@@ -38,6 +44,7 @@ def save_results(
         directory: Where to write; made when it does not exist.
         config: Settings that it was built with.
         seed: Seed that it was built with.
+        kept: Map file that has just been written by its owner; the one of the results may be it.
 
     Returns:
         The names of the files.
@@ -75,10 +82,13 @@ def save_results(
         "busy_s": {"odometry": report.odometry_busy_s, "topology": report.topology_busy_s},
         "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
     }
+    if (usage := engine.memory_usage) is not None:
+        summary["submaps_mb"] = {"memory": usage.held_bytes / 1e6, "disk": usage.shelf_bytes / 1e6}
     directory.mkdir(parents=True, exist_ok=True)
     trajectory = engine.trajectory()
     _replace(directory / TRAJECTORY, lambda path: write_tum(path, trajectory))
-    if not engine.is_frozen:
+    is_kept = kept is not None and kept.resolve() == (directory / MAP).resolve()
+    if not (engine.is_frozen or is_kept):
         write_map(directory / MAP, engine.stored())
     audit = engine.audit
     _replace(directory / EVENTS, lambda path: write_events(path, audit.events))

@@ -99,6 +99,34 @@ def test_a_map_goes_on_with_another_log(log: Path, tmp_path: Path) -> None:
     assert "does not exist" in str(missing.exception)
 
 
+def test_a_memory_budget_changes_no_byte_of_the_map(log: Path, tmp_path: Path) -> None:
+    outs = [tmp_path / name for name in ("all", "some")]
+    for out, arguments in zip(outs, ([], ["--memory-budget", "32MB"]), strict=True):
+        result = run(log, out, *arguments)
+        assert result.exit_code == 0, result.output
+    for name in ("map.hmt", "trajectory.tum"):
+        assert (outs[0] / name).read_bytes() == (outs[1] / name).read_bytes()
+    summary = json.loads((outs[1] / "summary.json").read_text())
+    # The whole flat fits.
+    assert 0.0 < summary["submaps_mb"]["memory"] < 32.0
+    assert summary["submaps_mb"]["disk"] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("size", "expected"),
+    [
+        ("many", "no size of memory"),
+        ("-1GB", "no size of memory"),
+        ("900kB", "0.9 MB is too small"),
+    ],
+)
+def test_a_budget_that_is_none_is_refused(
+    log: Path, tmp_path: Path, size: str, expected: str
+) -> None:
+    result = run(log, tmp_path, "--memory-budget", size)
+    assert expected in str(result.exception)
+
+
 def test_summary_and_map_file_agree(log: Path, tmp_path: Path) -> None:
     run(log, tmp_path)
     summary = json.loads((tmp_path / "summary.json").read_text())

@@ -5,10 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from hmt_service.core.footprint import footprint_bytes
 from hmt_service.core.geometry import FloatArray, inverse, planar_pose
 from hmt_service.core.stored import ScanLog
 from hmt_service.core.submap import Visit
-from hmt_service.core.visits import Visits, gaps_m, share_new
+from hmt_service.core.visits import MemoryBudget, Visits, gaps_m, share_new
+from hmt_service.errors import InvalidInput
+from hmt_service.io.shelf import DiskShelf
+from tests.core.budgets import tiny
 from tests.core.factories import ROOM, box, line, visit_along
 
 START = planar_pose(-1.5, 0.2, 0.3)
@@ -83,9 +87,56 @@ def test_scans_come_back_as_they_came() -> None:
     relative = [inverse(PATH[0]) @ pose for pose in PATH]
     for index, pose in enumerate(relative):
         log.append(0.1 * index, 7, pose)
-    scans = list(log)
+    scans = list(log.scans())
     assert [scan.stamp_s for scan in scans] == [0.1 * index for index in range(len(PATH))]
     assert {scan.keyframe_index for scan in scans} == {7}
     for scan, pose in zip(scans, relative, strict=True):
         assert scan.keyframe_from_body == pytest.approx(pose, abs=1e-6)
-    assert list(ScanLog()) == []
+    assert list(ScanLog().scans()) == []
+
+
+def test_what_was_used_longest_ago_is_on_the_shelf_and_comes_back() -> None:
+    whole = [*three(), visit_along(ROOM, PATH, visit=3), visit_along(ROOM, PATH[::-1], visit=4)]
+    sizes = [footprint_bytes(visit) for visit in whole]
+    budget = tiny(sum(sizes) - sizes[1] // 2)
+    visits = Visits(whole, budget=budget)
+    assert visits.usage is not None
+    assert visits.usage.shelf_bytes > 0
+    # The first one gave way; asked for, it pushes out the next.
+    assert visits[0] is not whole[0]
+    assert visits[0] is visits[0]
+    assert visits[4] is whole[4]
+    assert [visits.keyframes(visit) for visit in visits] == [len(v.keyframes) for v in whole]
+    for visit, before in zip(visits.values(), whole, strict=True):
+        assert np.array_equal(visit.points, before.points)
+        assert all(map(np.array_equal, visit.cells, before.cells))
+    stored = [keyframe.stamp_s for keyframe in visits.all_keyframes()]
+    assert stored == [keyframe.stamp_s for visit in whole for keyframe in visit.keyframes]
+
+
+def test_no_more_than_the_budget_is_in_memory_whatever_is_asked_for() -> None:
+    whole = [*three(), *(visit_along(ROOM, PATH, visit=3 + more) for more in range(5))]
+    largest = max(footprint_bytes(visit) for visit in whole)
+    visits = Visits(whole, budget=tiny(4 * largest))
+    for visit in (0, 1, 5, 2, 0, 7, 3, 6):
+        assert len(visits[visit].points)
+        assert visits[visit].local_map is not None
+        visits.put(visits[7])
+        assert visits.usage is not None
+        assert visits.usage.held_bytes <= 4 * largest + footprint_bytes(visits[visit])
+    visits.forget(1)
+    assert visits.is_forgotten(1)
+    assert not len(visits[1].points)
+
+
+def test_a_budget_that_is_too_small_says_so() -> None:
+    with pytest.raises(InvalidInput, match="of 5 MB is too small"):
+        MemoryBudget(5_000_000, DiskShelf())
+
+
+def test_footprint_counts_each_array_once_and_what_views_are_of() -> None:
+    numbers = np.zeros(100_000)
+    alone = footprint_bytes(numbers)
+    assert alone == pytest.approx(numbers.nbytes, abs=300)
+    assert footprint_bytes((numbers, numbers, numbers[::2])) == pytest.approx(alone, abs=600)
+    assert footprint_bytes(numbers[:1]) == pytest.approx(alone, abs=300)

@@ -14,7 +14,8 @@ import pytest
 from hmt_service.core.geometry import GaussianPose, exp
 from hmt_service.errors import InvalidInput, NotFound
 from hmt_service.io.map_check import check_map
-from hmt_service.io.map_file import DIGEST, SCHEMA_VERSION, TABLES, content_digest, write_map
+from hmt_service.io.map_file import write_map
+from hmt_service.io.map_rows import DIGEST, SCHEMA_VERSION, TABLES, content_digest
 from tests.mapped import map_file_in, mapped
 
 

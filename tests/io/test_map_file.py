@@ -24,8 +24,9 @@ from hmt_service.core.stored import (
 from hmt_service.core.types import Keyframe, MapMethod, Points, TrackingFailure
 from hmt_service.errors import InvalidInput, NotFound, Unavailable
 from hmt_service.io.map_check import check_map
-from hmt_service.io.map_file import POINT_RESOLUTION_M, SCHEMA_VERSION, read_map, write_map
+from hmt_service.io.map_file import read_map, write_map
 from hmt_service.io.map_info import map_info
+from hmt_service.io.map_rows import POINT_RESOLUTION_M, SCHEMA_VERSION
 
 
 def random_pose(rng: np.random.Generator) -> Pose:
@@ -64,7 +65,9 @@ def random_map(
                 hypothesis,
                 float(rng.normal()),
                 tuple(
-                    StoredAssignment(visit, visit, random_gaussian(rng) if visit % 2 else None)
+                    StoredAssignment(
+                        visit, visit, random_gaussian(rng) if visit % 2 else None, visit % 3 == 0
+                    )
                     for visit in range(visits)
                 ),
                 {visit: random_pose(rng) for visit in range(visits)},

@@ -13,8 +13,9 @@ import pytest
 
 from hmt_service import __version__
 from hmt_service.core.config import Preset, load_config
-from hmt_service.io.map_file import SCHEMA_VERSION, write_map
+from hmt_service.io.map_file import write_map
 from hmt_service.io.map_info import map_info
+from hmt_service.io.map_rows import SCHEMA_VERSION
 from tests.mapped import SCANS, map_file_in, mapped
 
 

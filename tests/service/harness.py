@@ -5,7 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -53,7 +53,7 @@ def running_daemon(
     is_awaited: bool = True,
     preset: Preset = Preset.PLANAR,
     map_file: Path | None = None,
-    is_frozen: bool = False,
+    options: Sequence[str] = (),
 ) -> Iterator[RunningDaemon]:
     """Run a daemon that is killed at the end.
 
@@ -63,14 +63,14 @@ def running_daemon(
         is_awaited: Whether it shall be ready for work.
         preset: Kind of sensor that it expects.
         map_file: Map file to go on with.
-        is_frozen: Whether it stays as it is.
+        options: More of `hmt serve`.
     """
     endpoint = router or free_endpoint()
     settings = out.parent / "settings.yaml"
     settings.write_text(SETTINGS)
-    command = [sys.executable, "-m", "hmt_service", "serve", "--out", str(out)]
+    command = [sys.executable, "-m", "hmt_service", "serve", "--out", str(out), *options]
     if map_file is not None:
-        command += ["--map", str(map_file), *(["--frozen"] if is_frozen else [])]
+        command += ["--map", str(map_file)]
     if map_file is None or not map_file.exists():
         command += ["--preset", preset, "--config", str(settings)]
     meeting = ["--connect", router] if router else ["--listen", endpoint]

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import os
+import resource
 import signal
 import sqlite3
 from contextlib import closing
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +20,7 @@ from hmt_service.cli.app import app
 from hmt_service.cli.serve import NOT_SAVED
 from hmt_service.core.config import load_config
 from hmt_service.core.geometry import inverse
+from hmt_service.core.odometry import Odometry
 from hmt_service.core.types import EventKind, TrackingFailure
 from hmt_service.errors import InvalidInput
 from hmt_service.io.map_check import check_map
@@ -103,13 +107,91 @@ def test_a_map_file_that_cannot_be_written_is_an_event_and_keeps_what_it_held(
     before = known.read_bytes()
     with running_daemon(tmp_path / "out", map_file=known) as daemon, daemon.client() as client:
         # Nothing can be put beside it, not even by root.
-        (folder / f"{known.name}.partial").mkdir()
+        (folder / f"{known.name}-wal").mkdir()
         publish(client, 0, 100, later_s=1e4)
         wait_until(lambda: any(e.kind is EventKind.NOT_SAVED for e in client.events()))
         status = client.status()
         assert status.stored_keyframes == len(mapped().stored().keyframes)
         assert status.processed_scans > 0
+    (folder / f"{known.name}-wal").rmdir()
     assert known.read_bytes() == before
+
+
+def test_a_daemon_whose_disk_was_full_catches_up_when_there_is_room(tmp_path: Path) -> None:
+    known = tmp_path / "known.hmt"
+    with running_daemon(tmp_path / "out", map_file=known) as daemon, daemon.client() as client:
+        publish(client, 0, 100)
+        wait_for(client, "stored_keyframes", 1)
+        pids = {process.name: process.pid for process in client.status().processes}
+        topology = pids[ProcessName.TOPOLOGY]
+        before = resource.prlimit(topology, resource.RLIMIT_FSIZE, (4096, resource.RLIM_INFINITY))
+        further = count(100)
+
+        def is_told() -> bool:
+            # What is said of the file comes with the answer to a scan.
+            scan = next(further)
+            publish(client, scan, scan + 1)
+            return any(e.kind is EventKind.NOT_SAVED for e in client.events())
+
+        wait_until(is_told)
+        stored = client.status().stored_keyframes
+        assert len(read_map(known).keyframes) == stored < client.status().keyframes
+        resource.prlimit(topology, resource.RLIMIT_FSIZE, before)
+        wait_until(lambda: is_told() and client.status().stored_keyframes > stored)
+    assert check_map(known) == ()
+
+
+def test_of_two_daemons_on_one_map_the_second_to_write_says_so(tmp_path: Path) -> None:
+    known = map_file_in(tmp_path)
+    first, second = (running_daemon(tmp_path / name / "out", map_file=known) for name in "ab")
+    for name in "ab":
+        (tmp_path / name).mkdir()
+    with first as one, second as other, one.client() as to_one, other.client() as to_other:
+        keyframes = len(read_map(known).keyframes)
+        publish(to_one, 0, 50, later_s=1e4)
+        wait_for(to_one, "stored_keyframes", keyframes + 1)
+        publish(to_other, 0, 50, later_s=1e4)
+        wait_until(lambda: any(e.kind is EventKind.NOT_SAVED for e in to_other.events()))
+        (refused, *_) = [e for e in to_other.events() if e.kind is EventKind.NOT_SAVED]
+        assert "another program has written" in refused.message
+        # The first one goes on, and its map is read by others meanwhile.
+        publish(to_one, 50, 150, later_s=1e4)
+        wait_until(lambda: to_one.status().processed_scans == 150)
+        to_one.save()
+        assert not any(e.kind is EventKind.NOT_SAVED for e in to_one.events())
+        assert check_map(known) == ()
+        assert len(read_map(known).keyframes) == to_one.status().keyframes
+
+
+def test_a_daemon_that_ends_leaves_one_file_which_may_be_among_its_results(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    known = out / "map.hmt"
+    with running_daemon(out, map_file=known) as daemon, daemon.client() as client:
+        publish(client, 0, 100)
+        wait_until(lambda: client.status().processed_scans == 100)
+        keyframes = client.status().keyframes
+        daemon.process.terminate()
+        assert "saved" in daemon.output()
+    assert daemon.process.returncode == 0
+    assert [path.name for path in out.glob("map*")] == ["map.hmt"]
+    assert len(read_map(known).keyframes) == keyframes
+    assert check_map(known) == ()
+
+
+def test_a_daemon_with_a_memory_budget_begins_a_map_and_goes_on_with_it(tmp_path: Path) -> None:
+    known, out = tmp_path / "known.hmt", tmp_path / "out"
+    for session in range(2):
+        with (
+            running_daemon(out, map_file=known, options=["--memory-budget", "40MB"]) as daemon,
+            daemon.client() as client,
+        ):
+            publish(client, 0, 100, later_s=1e4 * session)
+            wait_until(lambda: client.status().processed_scans == 100)
+            client.save()
+    summary = json.loads((out / "summary.json").read_text())
+    assert 0.0 < summary["submaps_mb"]["memory"] < 40.0
+    assert len(read_map(known).scans) == 200
 
 
 def test_results_that_cannot_be_saved_do_not_keep_the_map_back(tmp_path: Path) -> None:
@@ -144,7 +226,7 @@ def test_a_frozen_map_is_only_read(tmp_path: Path) -> None:
     known, out = map_file_in(tmp_path), tmp_path / "out"
     before, keyframes = known.read_bytes(), len(mapped().stored().keyframes)
     with (
-        running_daemon(out, map_file=known, is_frozen=True) as daemon,
+        running_daemon(out, map_file=known, options=["--frozen"]) as daemon,
         daemon.client() as client,
     ):
         # What the map is, is known before anything comes.
@@ -184,10 +266,16 @@ def test_damage_that_only_the_digest_shows_is_refused(tmp_path: Path) -> None:
 def test_a_link_to_a_map_stays_a_link(tmp_path: Path) -> None:
     known, link = map_file_in(tmp_path), tmp_path / "link.hmt"
     link.symlink_to(known)
-    before = known.stat().st_ino
-    KeptMap(link).write(mapped())
+    before = known.read_bytes()
+    with closing(KeptMap(link)) as kept:
+        engine = kept.engine(load_config(), seed=0)
+        tracking = Odometry(read_map(known).config).process(readings(1)[1])
+        assert tracking is not None
+        engine.process(tracking)
+        kept.write(engine)
     assert link.is_symlink()
-    assert known.stat().st_ino != before
+    assert known.read_bytes() != before
+    assert read_map(known).revision == mapped().stored().revision + 1
 
 
 def test_settings_of_a_map_that_goes_on_are_its_own(tmp_path: Path) -> None:
