@@ -18,6 +18,7 @@ import numpy as np
 
 from hmt_service.core.geometry import (
     ANY_HEADING_RAD,
+    FloatArray,
     GaussianPose,
     confined,
     identity,
@@ -74,10 +75,25 @@ def anywhere_in(target: Visit, visit: Visit, presence_m: float) -> GaussianPose:
         presence_m: How far from where it has been there a robot is still in the area.
     """
     sigma_m = target.radius_m + visit.radius_m + presence_m
+    return _in_any_heading(target.centre, visit, sigma_m)
+
+
+def beside_keyframes(target: Visit, visit: Visit, presence_m: float) -> tuple[GaussianPose, ...]:
+    """Return the same as what it consists of: a place beside each keyframe of the area.
+
+    Areas are cut as they come: only so two places that were passed alike are alike.
+    """
+    return tuple(
+        _in_any_heading(pose.mean[:3, 3], visit, presence_m) for pose in target.visit_from_keyframe
+    )
+
+
+def _in_any_heading(position: FloatArray, visit: Visit, sigma_m: float) -> GaussianPose:
+    """Return the pose of a visit whose middle is about at a position, shape (3,), m."""
     covariance = isotropic_covariance(sigma_rad=ANY_HEADING_RAD, sigma_m=sigma_m)
     covariance[:2, :2] = _LEVEL_RAD**2 * np.eye(2)
-    middle_over_middle = identity()
-    middle_over_middle[:3, 3] = target.centre - visit.centre
+    middle_over_position = identity()
+    middle_over_position[:3, 3] = position - visit.centre
     return GaussianPose(
-        middle_over_middle, confined(covariance, is_planar=visit.config.sensor.is_planar)
+        middle_over_position, confined(covariance, is_planar=visit.config.sensor.is_planar)
     )

@@ -331,7 +331,7 @@ def _known_directions(
 
     Along a blank corridor only clutter and the noise of normals oppose a translation. What they say
     is better than nothing for the mean (to leave it to the prior alone made drifts up to twice as
-    large in simulated worlds), but worth no certainty.
+    large in simulated worlds) until it adds up to what the prior forbids, but worth no certainty.
 
     Args:
         information: Tangent order, shape (6, 6).

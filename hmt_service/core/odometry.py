@@ -51,7 +51,7 @@ _KEPT_CELLS, _REGISTERED_CELLS = 0.5, 1.5
 # New space makes a keyframe after this share of the usual motion: never while standing still.
 _LEAST_MOTION_SHARE = 0.2
 # Squared standard deviations by which a scan may move a pose where it says next to nothing.
-_DRAWN2 = 9.0
+_DRAWN2 = 4.0
 # Of so many intervals between scans, the median is what a sweep takes.
 _INTERVALS = 15
 

@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 
 from hmt_service.core.alignment import Aligner, Mode
-from hmt_service.core.awakening import anywhere, anywhere_in, is_anywhere
+from hmt_service.core.awakening import anywhere, anywhere_in, beside_keyframes, is_anywhere
 from hmt_service.core.config import Config
 from hmt_service.core.geometry import (
     PLANAR_AXES,
@@ -80,6 +80,9 @@ class _Question:
 class _Candidate:
     area: int
     area_from_visit: GaussianPose
+    """Prior of the pose, or what it is within."""
+    parts: tuple[GaussianPose, ...] = ()
+    """What the prior consists of, in equal shares, if that is not one Gaussian."""
     mass: float = 1.0
     """Prior probability of the area where it is not in the pose: nothing else says where it is."""
 
@@ -185,8 +188,7 @@ class Transition:
                 candidate.area,
                 mode.target_from_visit,
                 mode.overlap,
-                self._log_factor(visit, visits[candidate.area], candidate.area_from_visit, mode)
-                + float(np.log(candidate.mass)),
+                self._log_factor(visit, visits[candidate.area], candidate, mode),
             )
             for candidate in candidates
             for mode in self._aligner.modes(
@@ -249,6 +251,7 @@ class Transition:
             _Candidate(
                 area,
                 anywhere_in(visits[area], where.visit, self._config.presence_m),
+                beside_keyframes(visits[area], where.visit, self._config.presence_m),
                 inside * visits.keyframes(area) / keyframes,
             )
             for area in areas
@@ -273,17 +276,21 @@ class Transition:
             inside += float(np.mean(distances <= self._config.presence_m))
         return float(np.clip(1.0 - inside, 1.0 / (samples + 1), samples / (samples + 1)))
 
-    def _log_factor(self, visit: Visit, target: Visit, prior: GaussianPose, mode: Mode) -> float:
+    def _log_factor(self, visit: Visit, target: Visit, candidate: _Candidate, mode: Mode) -> float:
         """Return the log of the Laplace integral of prior times likelihood around one mode."""
         # The peak of prior times likelihood; along a corridor only the prior says where that is.
-        peak = prior.fuse(mode.target_from_visit).mean
+        peak = candidate.area_from_visit.fuse(mode.target_from_visit).mean
         poses = [peak @ pose.mean for pose in visit.visit_from_keyframe]
         log_ratio = sum(
             news.share
             * self._observation.log_ratio(news.keyframe, target.known_from(pose[:3, 3]), pose)
             for news, pose in zip(visit.news, poses, strict=True)
         )
-        return log_ratio + self._log_prior(prior, mode, self._widening(visit, mode))
+        widening = self._widening(visit, mode)
+        parts = candidate.parts or (candidate.area_from_visit,)
+        log_priors = [self._log_prior(part, mode, widening) for part in parts]
+        log_prior = float(np.logaddexp.reduce(log_priors)) - math.log(len(parts))
+        return log_ratio + log_prior + math.log(candidate.mass)
 
     def _widening(self, visit: Visit, mode: Mode) -> float:
         """Return how much wider, as a variance, the likelihood is than the registration.

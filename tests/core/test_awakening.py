@@ -144,7 +144,7 @@ def test_who_wakes_up_outside_is_in_a_part_of_its_own_until_a_known_place_comes(
 
 @pytest.mark.parametrize("there", [130, 190])
 def test_who_is_carried_away_finds_out_where_to(there: int) -> None:
-    lap, after = ring_path(laps=1.2), ring_path(laps=1.0)[there : there + 40]
+    lap, after = ring_path(laps=1.2), ring_path(laps=1.6)[there : there + 70]
     engine = carried(lap, after)
     lost = [event for event in engine.audit.events if event.kind is EventKind.LOST]
     assert len(lost) == 1

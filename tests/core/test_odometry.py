@@ -712,3 +712,20 @@ def planar_square(pose: Pose, truth: Pose, tracking: Tracking) -> float:
 def test_scan_of_a_wrong_shape_is_refused(points: FloatArray, times: FloatArray | None) -> None:
     with pytest.raises(InvalidInput, match="shape"):
         Odometry(load_config()).process(Scan(0.0, points, np.zeros(3), times))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_walls_that_end_where_the_laser_does_hold_nobody_back(seed: int) -> None:
+    # Of a blank corridor it always sees the same, and the ends of that come along.
+    path, rng = line(identity(), length_m=12.0, step_m=0.1), np.random.default_rng(seed)
+    readings: list[Reading] = []
+    for index, pose in enumerate(path):
+        points = points_from(CORRIDOR, pose, noise_m=rng.normal(0.0, 0.03, BEAMS))
+        seen = points[np.linalg.norm(points, axis=1) < 8.0]
+        readings += [OdometryReading(0.2 * index, pose), Scan(0.2 * index, seen, np.zeros(3))]
+    trackings = track(readings)
+    motions = [t.keyframe.previous_from_body for t in trackings if t.keyframe is not None]
+    end = reduce(lambda one, other: one @ other, motions) @ trackings[-1].keyframe_from_body
+    error_m = abs(end.mean[0, 3] - 12.0)
+    assert error_m < 1.0
+    assert error_m < 3.0 * end.sigma_m
