@@ -63,7 +63,8 @@ def export(
             "--format",
             help="tum, kitti: trajectory of all scans; g2o: pose graph; ply, pcd: points; "
             "ros-map: occupancy grid of a planar map (.yaml, with its .pgm beside it); mcap: "
-            "areas and trajectory for Foxglove.",
+            "areas and trajectory for Foxglove; rrd: areas, arcs, trajectory and topology for "
+            "Rerun (needs the extra `view`).",
         ),
     ],
     out: Annotated[Path, typer.Option(help="File to write; replaced as a whole.")],

@@ -26,3 +26,5 @@ class Format(StrEnum):
     """Occupancy grid for map_server; planar maps only."""
     MCAP = "mcap"
     """Areas and trajectory, for Foxglove."""
+    RRD = "rrd"
+    """Areas, arcs, trajectory and topology, for Rerun."""

@@ -14,6 +14,7 @@ from hmt_service.io.exporters.clouds import export_pcd, export_ply
 from hmt_service.io.exporters.formats import Format
 from hmt_service.io.exporters.g2o import export_g2o
 from hmt_service.io.exporters.mcap import export_mcap
+from hmt_service.io.exporters.rerun import export_rerun
 from hmt_service.io.exporters.ros_map import export_ros_map
 from hmt_service.io.exporters.trajectories import export_kitti, export_tum
 from hmt_service.io.map_file import read_map
@@ -27,6 +28,7 @@ _EXPORTERS: Mapping[Format, Callable[[PlacedMap, Path], None]] = {
     Format.PCD: export_pcd,
     Format.ROS_MAP: export_ros_map,
     Format.MCAP: export_mcap,
+    Format.RRD: export_rerun,
 }
 _WITHOUT_POINTS = frozenset({Format.TUM, Format.KITTI, Format.G2O})
 
