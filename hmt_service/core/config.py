@@ -191,7 +191,7 @@ class ObservationConfig(Section):
     """Width of one cell of the grid that the submap is projected into."""
     hit_weight: float = Field(default=0.75, gt=0.0, lt=1.0)
     """Share of beams that end on what the submap holds; the rest follows the background density."""
-    independent_beams: float = Field(default=6.0, gt=0.0)
+    independent_beams: float = Field(default=8.0, gt=0.0)
     """How many independent readings the beams of one scan amount to: they are correlated."""
 
 
