@@ -136,14 +136,22 @@ class Transition:
         log_share = math.log(self._config.carried_share)
         log_rest = math.log1p(-self._config.carried_share)
         put_down = replace(arc, a_from_b=anywhere(is_planar=hypothesis.graph.is_planar))
-        carried = self._entries(hypothesis, visit, put_down, visits)
+        # Nobody carries it across a whole site, and each area is searched in every heading.
+        most = self._config.max_carried_areas
+        carried = self._entries(hypothesis, visit, put_down, visits, most=most)
         return (
             *(replace(s, log_factor=s.log_factor + log_rest) for s in moved),
             *(replace(s, log_factor=s.log_factor + log_share, is_carried=True) for s in carried),
         )
 
     def _entries(
-        self, hypothesis: Hypothesis, visit: Visit, arc: Factor, visits: Visits
+        self,
+        hypothesis: Hypothesis,
+        visit: Visit,
+        arc: Factor,
+        visits: Visits,
+        *,
+        most: int | None = None,
     ) -> tuple[Successor, ...]:
         """Return every place that the new visit may be to if the motion is to be believed."""
         where = _Question(hypothesis, visit, arc.visit_a, arc.a_from_b, visits)
@@ -151,7 +159,7 @@ class Transition:
         outside = self._mass_outside(candidates, visit, visits)
         # Who wakes up is in the map or outside; who has been outside goes on there.
         new = outside * self._config.outside_share if where.is_open else outside
-        candidates += self._anywhere(where, new)
+        candidates += self._anywhere(where, new, most)
         successor = Successor(None, None, 0.0, float(np.log(new)))
         return (successor, *self._matches(visit, candidates, visits))
 
@@ -233,7 +241,9 @@ class Transition:
         is_known = not is_lost and is_certain(where.known_from_visit, self._refinement)
         return known if is_known and where.hypothesis.current.area == known else None
 
-    def _anywhere(self, where: _Question, outside: float) -> list[_Candidate]:
+    def _anywhere(
+        self, where: _Question, outside: float, most: int | None = None
+    ) -> list[_Candidate]:
         """Return the areas that the visit may be to because nobody knows where those are.
 
         A robot that wakes up is as likely beside one keyframe of the map as beside another, and may
@@ -242,9 +252,14 @@ class Transition:
         Args:
             where: What is asked.
             outside: Probability that it is in no area at all.
+            most: How many, those nearest to where the robot was; None for all.
         """
         visits, share = where.visits, self._config.outside_share
         areas = [area for area in where.hypothesis.topology.areas if area not in where.part]
+        if most is not None and len(areas) > most:
+            positions = where.hypothesis.graph.poses()[:, :3, 3]
+            away_m = np.linalg.norm(positions[areas] - positions[where.known], axis=1)
+            areas = [areas[i] for i in np.sort(np.argsort(away_m, kind="stable")[:most])]
         keyframes = sum(visits.keyframes(area) for area in areas)
         inside = outside * (1.0 - share) / share
         return [

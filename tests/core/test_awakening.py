@@ -33,9 +33,10 @@ from tests.mapped import mapped
 LATER_S = 1000.0
 
 
-def carried(before: Sequence[Pose], after: Sequence[Pose]) -> Engine:
+def carried(before: Sequence[Pose], after: Sequence[Pose], settings: str = "") -> Engine:
     """Map a drive on which the wheels notice nothing of being lifted from one place to another."""
-    engine, odometry = Engine(load_config()), Odometry(load_config())
+    config = load_config(text=settings)
+    engine, odometry = Engine(config), Odometry(config)
     put_down = before[-1] @ inverse(after[0])
     wheels = [*before, *(put_down @ pose for pose in after)]
     noise = np.random.default_rng(2)
@@ -164,6 +165,20 @@ def test_who_is_carried_away_finds_out_where_to(there: int) -> None:
     for one, two in zip(best.areas, shortest.areas, strict=True):
         apart = inverse(one.reference_from_area.mean) @ two.reference_from_area.mean
         assert np.abs(log(apart)[3:]).max() < 0.3
+
+
+@pytest.mark.parametrize(("most", "asked"), [(1, {0}), (32, {0, 1})])
+def test_who_is_carried_is_looked_for_in_the_nearest_areas(most: int, asked: set[int]) -> None:
+    lap, after = ring_path(laps=1.2), ring_path(laps=1.6)[130:145]
+    engine = carried(lap, after, f"transition: {{max_carried_areas: {most}}}")
+    (lost,) = [event for event in engine.audit.events if event.kind is EventKind.LOST]
+    branched = [
+        event
+        for event in engine.audit.events
+        if event.kind is EventKind.BRANCHED and event.stamp_s == lost.stamp_s
+    ]
+    known = {int(event.numbers["area"]) for event in branched if "again" in event.message}
+    assert known == asked
 
 
 def test_a_scan_that_does_not_fit_is_no_reason_to_be_elsewhere() -> None:
