@@ -21,7 +21,6 @@ from hmt_service.cli.settings import (
     kept_map,
     settings_of_map,
 )
-from hmt_service.errors import NotFound
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -57,9 +56,7 @@ def run(
     from hmt_service.service.results import save_results
 
     console = Console(stderr=True)
-    if map_file is not None and not map_file.is_file():
-        raise NotFound(f"map file {map_file} does not exist")
-    kept = kept_map(map_file, is_frozen=frozen)
+    kept = kept_map(map_file, is_frozen=frozen, is_known=True)
     settings = settings_of_map(map_file, preset, config)
     budget = budget_of(memory_budget)
     with console.status(f"reading {log}"):

@@ -93,7 +93,7 @@ def serve(
     console = Console(stderr=True)
     handler = RichHandler(console=console, show_path=False)
     logging.basicConfig(level=logging.INFO, format="%(message)s", handlers=[handler])
-    kept = kept_map(map_file, is_frozen=frozen)
+    kept = kept_map(map_file, is_frozen=frozen, is_known=frozen)
     settings = settings_of_map(map_file, preset, config)
     budget = budget_of(memory_budget)
     if map_file is not None and not map_file.absolute().parent.is_dir():

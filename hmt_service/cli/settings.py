@@ -83,12 +83,17 @@ def settings_of_map(map_file: Path | None, preset: Preset | None, config: Path |
     return read_config(map_file)
 
 
-def kept_map(map_file: Path | None, *, is_frozen: bool) -> KeptMap | None:
+def kept_map(map_file: Path | None, *, is_frozen: bool, is_known: bool) -> KeptMap | None:
     """Return the map that goes on, if one is named.
+
+    Args:
+        map_file: The file.
+        is_frozen: Whether it stays as it is.
+        is_known: Whether it must be there already.
 
     Raises:
         InvalidInput: If there is nothing that could be frozen.
-        NotFound: If a map that is frozen does not exist.
+        NotFound: If a map that must be there is not.
     """
     from hmt_service.service.kept_map import KeptMap
 
@@ -96,7 +101,7 @@ def kept_map(map_file: Path | None, *, is_frozen: bool) -> KeptMap | None:
         if is_frozen:
             raise InvalidInput("--frozen needs the map that --map names")
         return None
-    if is_frozen and not map_file.is_file():
+    if is_known and not map_file.is_file():
         raise NotFound(f"map file {map_file} does not exist")
     return KeptMap(map_file, is_frozen=is_frozen)
 

@@ -27,6 +27,7 @@ from hmt_service.core.geometry import (
 from hmt_service.core.types import Keyframe, TrackingFailure
 
 if TYPE_CHECKING:
+    from hmt_service.core.graph import Factor
     from hmt_service.core.submap import Visit
 
 
@@ -59,6 +60,11 @@ def anywhere(*, is_planar: bool) -> GaussianPose:
     """
     covariance = isotropic_covariance(sigma_rad=ANY_HEADING_RAD, sigma_m=_ANYWHERE_M)
     return GaussianPose(identity(), confined(covariance, is_planar=is_planar))
+
+
+def put_down(arc: Factor, *, is_planar: bool) -> Factor:
+    """Return the arc of a motion after which the robot was carried: it says nothing."""
+    return replace(arc, a_from_b=anywhere(is_planar=is_planar))
 
 
 def is_anywhere(pose: GaussianPose) -> bool:

@@ -138,11 +138,11 @@ class Engine:
             held = f"{len(stored.hypotheses)} hypotheses, {len(stored.visits)} visits"
             raise InvalidInput(f"the map is empty: {held}")
         engine = cls(config, seed=seed, budget=budget)
-        for keyframe in stored.keyframes:
-            engine._observation.learn(keyframe)
         for scan in stored.scans:
             engine._scans.append(scan.stamp_s, scan.keyframe_index, scan.keyframe_from_body)
         visits = engine._visits = restored_visits(stored, config, budget)
+        for keyframe in visits.all_keyframes():
+            engine._observation.learn(keyframe)
         engine._motions = [
             Factor(v, v + 1, visits[v].motion_to(visits[v + 1])) for v in range(len(visits) - 1)
         ]
@@ -223,7 +223,7 @@ class Engine:
 
         One scan was all that there was to find its place with, and to tell how it is turned.
         """
-        keyframes, stamp_s = len(visit.keyframes), visit.keyframes[-1].stamp_s
+        keyframes, stamp_s = len(visit.keyframes), visit.last_stamp_s
         is_due = keyframes >= _LEAST_LOOK and keyframes.bit_count() == 1
         if visit.keyframes[0].failure is None or not is_due:
             return ()
@@ -267,12 +267,12 @@ class Engine:
         """
         refined: tuple[Event, ...] = ()
         if self._revision > self._finished_revision:
-            refined = self._audited(self._refined(self._open, self._open.keyframes[-1].stamp_s))
+            refined = self._audited(self._refined(self._open, self._open.last_stamp_s))
             self._revision += 1
             self._finished_revision = self._revision
         if is_urgent or self.is_frozen or not self._visits or self._smooth_poses() is not None:
             return refined
-        recognised = self._audited(self._recognise(self._open, self._open.keyframes[-1].stamp_s))
+        recognised = self._audited(self._recognise(self._open, self._open.last_stamp_s))
         if recognised:
             self._revision += 1
             self._finished_revision = self._revision
@@ -306,7 +306,7 @@ class Engine:
         closed, opened, motion = visit.split(first_of_new)
         self._visits.put(closed)
         self._unweigh(opened.keyframes)
-        stamp_s = opened.keyframes[-1].stamp_s
+        stamp_s = opened.last_stamp_s
         settled = self._settle(closed, stamp_s)
         arc = Factor(closed.visit, opened.visit, motion)
         self._motions.append(arc)
@@ -452,7 +452,7 @@ class Engine:
     def _audited(self, events: tuple[Event, ...]) -> tuple[Event, ...]:
         """Keep what was decided, and what is believed since."""
         self._audit.note(events)
-        self._audit.believe(self._particles.belief(self._open.keyframes[-1].stamp_s))
+        self._audit.believe(self._particles.belief(self._open.last_stamp_s))
         return events
 
     # ------------------------------------------------------------------ what readers may ask
@@ -497,7 +497,7 @@ class Engine:
         if not self._visits:
             return None
         best, visit = self._particles.best, self._open
-        belief = self._particles.belief(visit.keyframes[-1].stamp_s)
+        belief = self._particles.belief(visit.last_stamp_s)
         visit_from_keyframe = visit.visit_from_keyframe[-1]
         return Snapshot(
             posterior=Posterior(

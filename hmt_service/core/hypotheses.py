@@ -20,7 +20,7 @@ from itertools import pairwise
 import numpy as np
 
 from hmt_service.core.alignment import SEPARATION_M, SEPARATION_RAD
-from hmt_service.core.awakening import anywhere, is_anywhere
+from hmt_service.core.awakening import is_anywhere, put_down
 from hmt_service.core.geometry import (
     FloatArray,
     GaussianPose,
@@ -159,7 +159,7 @@ class Hypothesis:
         """
         graph, place = self.graph.copy(), assignment.area_from_visit
         if assignment.is_carried:
-            arc = replace(arc, a_from_b=anywhere(is_planar=graph.is_planar))
+            arc = put_down(arc, is_planar=graph.is_planar)
         arcs = [arc]
         if place is not None:
             arcs.append(Factor(assignment.area, assignment.visit, place))

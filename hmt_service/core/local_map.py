@@ -157,9 +157,9 @@ class SeenPoints:
     def of_keyframe(
         cls, points: FloatArray, sensor_in_body: FloatArray, config: Config
     ) -> SeenPoints:
-        """Return what a keyframe adds to a local map: of a LiDAR's points, one per cell."""
+        """Return what a keyframe adds to a local map."""
         cell_m, is_planar = config.odometry.voxel_size_m, config.sensor.is_planar
-        kept = points if is_planar else points[thin(points, cell_m)]
+        kept = points_of_keyframe(points, config)
         return cls.of(kept, sensor_in_body, cell_m=cell_m, is_planar=is_planar)
 
     @classmethod
@@ -170,6 +170,11 @@ class SeenPoints:
             np.concatenate([transform_points(pose, part.points) for pose, part in posed]),
             np.concatenate([part.directions @ pose[:3, :3].T for pose, part in posed]),
         )
+
+
+def points_of_keyframe(points: FloatArray, config: Config) -> FloatArray:
+    """Return which points a keyframe adds to a local map: of a LiDAR's, one per cell."""
+    return points if config.sensor.is_planar else points[thin(points, config.odometry.voxel_size_m)]
 
 
 class LocalMap:

@@ -35,7 +35,7 @@ from hmt_service.core.geometry import (
 )
 from hmt_service.core.graph import Factor, optimised
 from hmt_service.core.hypotheses import Hypothesis
-from hmt_service.core.local_map import LocalMap, SeenPoints, Sweep
+from hmt_service.core.local_map import LocalMap, SeenPoints, Sweep, points_of_keyframe
 from hmt_service.core.types import Keyframe
 from hmt_service.core.visits import Visits
 
@@ -120,7 +120,7 @@ class Smoother:
         times = np.empty(len(keyframes), dtype=np.int64)
         for index, keyframe in enumerate(keyframes):
             times[index] = keyframe.index
-            points = self._seen(keyframe).points
+            points = points_of_keyframe(_points_of(keyframe), self._config)
             if len(points):
                 views[index] = transform_points(poses[index], points.mean(axis=0)[None])
         # Of keyframes that saw nothing nothing can be compared.
@@ -177,7 +177,7 @@ class Smoother:
         )
 
     def _seen(self, keyframe: Keyframe) -> SeenPoints:
-        points = np.ascontiguousarray(keyframe.points_in_body, dtype=np.float64)
+        points = _points_of(keyframe)
         return SeenPoints.of_keyframe(points, keyframe.sensor_in_body, self._config)
 
     def _sweep(self, seen: SeenPoints, keyframe: Keyframe) -> Sweep:
@@ -203,6 +203,10 @@ class Smoother:
             self._config,
             sigma_m=self._config.covariance.sigma_m,
         )
+
+
+def _points_of(keyframe: Keyframe) -> FloatArray:
+    return np.ascontiguousarray(keyframe.points_in_body, dtype=np.float64)
 
 
 def _is_unbroken(times: npt.NDArray[np.int64], first: int, second: int) -> bool:

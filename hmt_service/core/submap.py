@@ -83,6 +83,11 @@ class Visit:
         """Index of the last keyframe."""
         return self.keyframes[-1].index
 
+    @property
+    def last_stamp_s(self) -> float:
+        """Sensor time of the last keyframe."""
+        return self.keyframes[-1].stamp_s
+
     @cached_property
     def points(self) -> FloatArray:
         """Submap: what stood still, in the visit's frame, shape (N, 3), m.

@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 
 from hmt_service.core.alignment import Aligner, Mode
-from hmt_service.core.awakening import anywhere, anywhere_in, beside_keyframes, is_anywhere
+from hmt_service.core.awakening import anywhere_in, beside_keyframes, is_anywhere, put_down
 from hmt_service.core.config import Config
 from hmt_service.core.geometry import (
     PLANAR_AXES,
@@ -82,7 +82,7 @@ class _Candidate:
     area_from_visit: GaussianPose
     """Prior of the pose, or what it is within."""
     parts: tuple[GaussianPose, ...] = ()
-    """What the prior consists of, in equal shares, if that is not one Gaussian."""
+    """What the prior consists of, in equal shares and equally wide, if that is not one Gaussian."""
     mass: float = 1.0
     """Prior probability of the area where it is not in the pose: nothing else says where it is."""
 
@@ -135,10 +135,10 @@ class Transition:
             return moved
         log_share = math.log(self._config.carried_share)
         log_rest = math.log1p(-self._config.carried_share)
-        put_down = replace(arc, a_from_b=anywhere(is_planar=hypothesis.graph.is_planar))
+        nothing = put_down(arc, is_planar=hypothesis.graph.is_planar)
         # Nobody carries it across a whole site, and each area is searched in every heading.
         most = self._config.max_carried_areas
-        carried = self._entries(hypothesis, visit, put_down, visits, most=most)
+        carried = self._entries(hypothesis, visit, nothing, visits, most=most)
         return (
             *(replace(s, log_factor=s.log_factor + log_rest) for s in moved),
             *(replace(s, log_factor=s.log_factor + log_share, is_carried=True) for s in carried),
@@ -303,9 +303,7 @@ class Transition:
         )
         widening = self._widening(visit, mode)
         parts = candidate.parts or (candidate.area_from_visit,)
-        log_priors = [self._log_prior(part, mode, widening) for part in parts]
-        log_prior = float(np.logaddexp.reduce(log_priors)) - math.log(len(parts))
-        return log_ratio + log_prior + math.log(candidate.mass)
+        return log_ratio + self._log_prior(parts, mode, widening) + math.log(candidate.mass)
 
     def _widening(self, visit: Visit, mode: Mode) -> float:
         """Return how much wider, as a variance, the likelihood is than the registration.
@@ -317,20 +315,21 @@ class Transition:
         wider = (self._beams.hit_sigma_m / self._sigma_submap_m) ** 2
         return max(1.0, mode.overlap * len(visit.sweep.points) / readings * wider)
 
-    def _log_prior(self, prior: GaussianPose, mode: Mode, widening: float) -> float:
+    def _log_prior(self, parts: Sequence[GaussianPose], mode: Mode, widening: float) -> float:
         """Return log of N(x*; prior) times the volume of the mode.
 
         With a likelihood peak of shape N(x; x*, S), where x* is itself known with covariance B
         because submaps are bent, the integral over the prior N(x; m, P) is
-        sqrt(|S| / |P + B + S|) exp(-1/2 (x* - m)' (P + B + S)^-1 (x* - m)) times its height.
+        sqrt(|S| / |P + B + S|) exp(-1/2 (x* - m)' (P + B + S)^-1 (x* - m)) times its height. Of a
+        prior that consists of several such it is the mean.
         """
         block, pose = np.ix_(self._axes, self._axes), mode.target_from_visit
         width = widening * mode.width[block]
         bend = pose.covariance[block] - mode.width[block]
-        together: FloatArray = prior.covariance[block] + bend + width
-        gap = log(inverse(prior.mean) @ pose.mean)[self._axes]
+        together: FloatArray = parts[0].covariance[block] + bend + width
+        gaps = [log(inverse(part.mean) @ pose.mean)[self._axes] for part in parts]
+        exponents = [-0.5 * gap @ np.linalg.solve(together, gap) for gap in gaps]
         _, log_volume = np.linalg.slogdet(width)
         _, log_prior_volume = np.linalg.slogdet(together)
-        return float(
-            0.5 * (log_volume - log_prior_volume) - 0.5 * gap @ np.linalg.solve(together, gap)
-        )
+        near = np.logaddexp.reduce(exponents) - math.log(len(parts))
+        return float(0.5 * (log_volume - log_prior_volume) + near)

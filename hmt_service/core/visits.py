@@ -117,6 +117,10 @@ class _Path:
             visit.config,
         )
 
+    @property
+    def last_stamp_s(self) -> float:
+        return float(self.stamps_s[-1])
+
     def as_visit(self) -> Visit:
         """Return the visit, as one that saw nothing."""
         upper = _upper(self.config)
@@ -145,9 +149,15 @@ class _Path:
 class _Shelved:
     """What stays in memory of a visit on the shelf."""
 
-    keyframes: int
+    visit: int
+    count: int
     last_stamp_s: float
     config: Config
+    shelf: Shelf
+
+    @property
+    def keyframes(self) -> tuple[Keyframe, ...]:
+        return self.shelf.get(self.visit)
 
 
 def _upper(config: Config) -> tuple[np.ndarray, np.ndarray]:
@@ -184,7 +194,7 @@ class Visits(Mapping[int, Visit]):
         if isinstance(kept, _Path):
             return kept.as_visit()
         if isinstance(kept, _Shelved):
-            kept = self._visits[visit] = self._taken(visit, kept)
+            kept = self._visits[visit] = visit_of(visit, kept.keyframes, kept.config)
             self._use(kept)
             self._make_room()
         else:
@@ -241,8 +251,9 @@ class Visits(Mapping[int, Visit]):
         if visit not in self._on_shelf:
             self._budget.shelf.put(visit, kept.keyframes)
             self._on_shelf.add(visit)
-        last_stamp_s = kept.keyframes[-1].stamp_s
-        self._visits[visit] = _Shelved(len(kept.keyframes), last_stamp_s, kept.config)
+        self._visits[visit] = _Shelved(
+            visit, len(kept.keyframes), kept.last_stamp_s, kept.config, self._budget.shelf
+        )
         self._drop(visit)
 
     def _drop(self, visit: int) -> None:
@@ -250,10 +261,6 @@ class Visits(Mapping[int, Visit]):
         self._sizes.pop(visit, None)
         self._used.discard(visit)
         self._ready.pop(visit, None)
-
-    def _taken(self, visit: int, kept: _Shelved) -> Visit:
-        assert self._budget is not None, "without a budget nothing is put away"
-        return visit_of(visit, self._budget.shelf.get(visit), kept.config)
 
     @property
     def usage(self) -> MemoryUsage | None:
@@ -267,7 +274,7 @@ class Visits(Mapping[int, Visit]):
         kept = self._visits[visit]
         if isinstance(kept, _Path):
             return len(kept.stamps_s)
-        return kept.keyframes if isinstance(kept, _Shelved) else len(kept.keyframes)
+        return kept.count if isinstance(kept, _Shelved) else len(kept.keyframes)
 
     def all_keyframes(self) -> Sequence[Keyframe]:
         """Return the keyframes of all visits as they are now, in time order."""
@@ -275,19 +282,13 @@ class Visits(Mapping[int, Visit]):
 
         def of(visit: int) -> Sequence[Keyframe]:
             now = kept[visit]
-            if isinstance(now, _Shelved):
-                assert self._budget is not None, "without a budget nothing is put away"
-                return self._budget.shelf.get(visit)
             return now.as_visit().keyframes if isinstance(now, _Path) else now.keyframes
 
         return Chunked([self.keyframes(visit) for visit in self], of)
 
     def last_stamp_s(self, visit: int) -> float:
         """Return the sensor time of the last keyframe of a visit."""
-        kept = self._visits[visit]
-        if isinstance(kept, _Path):
-            return float(kept.stamps_s[-1])
-        return kept.last_stamp_s if isinstance(kept, _Shelved) else kept.keyframes[-1].stamp_s
+        return self._visits[visit].last_stamp_s
 
     def is_forgotten(self, visit: int) -> bool:
         """Return whether of a visit only the path is left."""

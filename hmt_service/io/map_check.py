@@ -268,8 +268,7 @@ def _extents(visits: Sequence[_Row], keyframes: int) -> Iterator[str]:
                 f"visits, visit {row['visit']}: keyframes {first} to {last}, "
                 f"the one before ends at {expected - 1}"
             )
-        if row.get("is_forgotten", 0) not in (0, 1):
-            yield f"visits, visit {row['visit']}: is_forgotten is {row['is_forgotten']}, not 0 or 1"
+        yield from _flag(f"visits, visit {row['visit']}", row, "is_forgotten")
         expected = last + 1
     if visits and expected != keyframes:
         yield f"visits: the last one ends at keyframe {expected - 1} of 0 to {keyframes - 1}"
@@ -283,6 +282,12 @@ def _weights(hypotheses: Sequence[_Row]) -> Iterator[str]:
         mass = float(np.sum(np.exp([row["log_weight"] for row in hypotheses])))
     if not abs(mass - 1.0) <= _MASS_TOLERANCE:
         yield f"hypotheses: the probabilities of {len(hypotheses)} sum to {mass:.9g}"
+
+
+def _flag(name: str, row: _Row, column: str) -> Iterator[str]:
+    """Yield why a truth value, which older versions do not have, is none."""
+    if row.get(column, 0) not in (0, 1):
+        yield f"{name}: {column} is {row[column]}, not 0 or 1"
 
 
 def _hypotheses(tables: Mapping[str, Sequence[_Row]], visits: Sequence[int]) -> Iterator[str]:
@@ -321,6 +326,7 @@ def _founders(name: str, assignments: Sequence[_Row]) -> Iterator[str]:
     founded = {row["area"] for row in assignments if row["area_from_visit"] is None}
     for row in assignments:
         visit, area = row["visit"], row["area"]
+        yield from _flag(f"{name}: visit {visit}", row, "is_carried")
         if (row["area_from_visit"] is None) != (area == visit):
             said = "founded" if row["area_from_visit"] is None else "was aligned with"
             yield f"{name}: visit {visit} {said} area {area}; an area is founded by its own visit"

@@ -44,7 +44,8 @@ SCHEMA_VERSION = 4
 """Version of what is written, in `PRAGMA user_version`."""
 READABLE = (2, 4)
 """First and last version that is read. In 3 came sessions and a digest; since 4 the digest can be
-brought up to date, and visits say themselves whether they were forgotten."""
+brought up to date, visits say themselves whether they were forgotten, and assignments whether the
+robot was carried there."""
 POINT_RESOLUTION_M = 0.005
 """Edge of the grid that points are rounded to."""
 
@@ -369,7 +370,7 @@ def _read_hypotheses(database: sqlite3.Connection) -> tuple[StoredHypothesis, ..
     for hypothesis, visit, area, pose, *is_carried in _rows(database, "assignments"):
         area_from_visit = None if pose is None else _gaussian(pose)
         assignments[hypothesis].append(
-            StoredAssignment(visit, area, area_from_visit, bool(any(is_carried)))
+            StoredAssignment(visit, area, area_from_visit, any(is_carried))
         )
     anchors = defaultdict[int, dict[int, Pose]](dict)
     for hypothesis, visit, pose in _rows(database, "anchors"):

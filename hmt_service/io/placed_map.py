@@ -103,14 +103,25 @@ class PlacedMap:
             for v in self.stored.visits
         )
 
+    @cached_property
+    def area_of(self) -> dict[int, int]:
+        """The area of every visit."""
+        return {a.visit: a.area for a in self.hypothesis.assignments}
+
     def points_in_areas(self) -> dict[int, FloatArray]:
         """Return the submap of every area in the reference frame, shape (N, 3) each, m."""
-        area_of = {a.visit: a.area for a in self.hypothesis.assignments}
         clouds: dict[int, list[FloatArray]] = {}
         for visit in self.visits:
             points = transform_points(self.reference_from_visit[visit.visit], visit.points)
-            clouds.setdefault(area_of[visit.visit], []).append(points)
+            clouds.setdefault(self.area_of[visit.visit], []).append(points)
         return {area: np.concatenate(of_area) for area, of_area in sorted(clouds.items())}
+
+    def submaps(self) -> dict[int, FloatArray]:
+        """Return the submap of every area in its own frame, shape (N, 3) each, m."""
+        return {
+            area: transform_points(inverse(self.reference_from_visit[area]), points)
+            for area, points in self.points_in_areas().items()
+        }
 
     def points(self) -> FloatArray:
         """Return the submaps of all areas in the reference frame, shape (N, 3), m."""

@@ -87,6 +87,11 @@ def test_truncated_file_is_a_damaged_map(tmp_path: Path, share: float) -> None:
         ("DELETE FROM visits WHERE visit = 1", "visits: number 2 stands where 1 should"),
         ("UPDATE visits SET first_keyframe = 5 WHERE visit = 0", "visit 0: keyframes 5 to"),
         ("UPDATE visits SET last_keyframe = 60 WHERE visit = 2", "visits: the last one ends at"),
+        ("UPDATE visits SET is_forgotten = 2 WHERE visit = 1", "visit 1: is_forgotten is 2, not"),
+        (
+            "UPDATE assignments SET is_carried = -1 WHERE visit = 1",
+            "visit 1: is_carried is -1, not",
+        ),
         ("DELETE FROM hypotheses", "hypotheses: there are none"),
         ("UPDATE hypotheses SET log_weight = -1.0", "probabilities of 1 sum to 0.367879441"),
         ("DELETE FROM assignments WHERE visit = 2", "assignments of visits 2 are missing, of 3"),

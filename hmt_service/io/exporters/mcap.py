@@ -19,7 +19,7 @@ from google.protobuf.timestamp_pb2 import Timestamp
 from mcap.writer import CompressionType
 from mcap_protobuf.writer import Writer
 
-from hmt_service.core.geometry import Pose, inverse, transform_points
+from hmt_service.core.geometry import Pose
 from hmt_service.core.types import StampedPose
 from hmt_service.errors import InvalidInput
 from hmt_service.io.foxglove import cloud_message, pose_message, timestamp_of
@@ -59,12 +59,11 @@ class _Log:
     def areas(self, placed: PlacedMap, stamp_s: float) -> None:
         """Write every area: its frame, and its submap in it."""
         stamp = timestamp_of(stamp_s)
-        poses, clouds = placed.reference_from_visit, placed.points_in_areas()
-        frames = [_frame(stamp, _area_frame(area), poses[area]) for area in clouds]
+        poses, submaps = placed.reference_from_visit, placed.submaps()
+        frames = [_frame(stamp, _area_frame(area), poses[area]) for area in submaps]
         self._write(TRANSFORM_TOPIC, FrameTransforms(transforms=frames), stamp)
-        for area, points in clouds.items():
-            cloud = transform_points(inverse(poses[area]), points).astype("<f4")
-            message = cloud_message(stamp_s, _area_frame(area), cloud)
+        for area, points in submaps.items():
+            message = cloud_message(stamp_s, _area_frame(area), points.astype("<f4"))
             self._write(f"/areas/{area}", message, stamp)
 
     def robot(self, pose: StampedPose) -> None:

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hmt_service.core.geometry import FloatArray, inverse, quaternion_of, transform_points
+from hmt_service.core.geometry import FloatArray, quaternion_of
 from hmt_service.core.stored import StoredFactor
 from hmt_service.errors import InvalidInput, Unavailable
 from hmt_service.io.placed_map import PlacedMap
@@ -82,13 +82,13 @@ def _areas(placed: PlacedMap) -> Iterator[Chunk]:
     import rerun as rr
 
     yield _static("/map", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
-    for area, points in placed.points_in_areas().items():
+    for area, points in placed.submaps().items():
         pose, entity = placed.reference_from_visit[area], f"/map/areas/{area}"
-        in_area, colour = transform_points(inverse(pose), points), _colour(area)
+        colour = _colour(area)
         label = rr.Points3D([[0.0, 0.0, 0.0]], colors=[colour], labels=[_name(area)])
         rotation = rr.Quaternion(xyzw=quaternion_of(pose))
         yield _static(entity, rr.Transform3D(translation=pose[:3, 3], quaternion=rotation))
-        yield _static(f"{entity}/points", rr.Points3D(in_area, colors=[colour]))
+        yield _static(f"{entity}/points", rr.Points3D(points, colors=[colour]))
         yield _static(f"{entity}/label", label)
 
 
@@ -120,8 +120,7 @@ def _trajectory(placed: PlacedMap) -> Iterator[Chunk]:
     lines: list[FloatArray] = [
         poses[v.first_keyframe : v.last_keyframe + 1, :3, 3] for v in placed.stored.visits
     ]
-    area_of = {a.visit: a.area for a in placed.hypothesis.assignments}
-    colours = [_colour(area_of[visit.visit]) for visit in placed.stored.visits]
+    colours = [_colour(placed.area_of[visit.visit]) for visit in placed.stored.visits]
     yield _static("/map/trajectory", rr.LineStrips3D(lines, colors=colours))
     stamps_s = np.array([keyframe.stamp_s for keyframe in placed.stored.keyframes[: len(poses)]])
     if not (np.abs(stamps_s) < _LAST_S).all():
@@ -137,10 +136,9 @@ def _trajectory(placed: PlacedMap) -> Iterator[Chunk]:
 def _topology(placed: PlacedMap) -> Chunk:
     import rerun as rr
 
-    area_of = {a.visit: a.area for a in placed.hypothesis.assignments}
-    ends = ((area_of[arc.visit_a], area_of[arc.visit_b]) for arc in _measured(placed))
+    ends = ((placed.area_of[arc.visit_a], placed.area_of[arc.visit_b]) for arc in _measured(placed))
     pairs = sorted({(min(pair), max(pair)) for pair in ends if pair[0] != pair[1]})
-    areas = sorted(set(area_of.values()))
+    areas = sorted(set(placed.area_of.values()))
     nodes = rr.GraphNodes(
         [str(area) for area in areas],
         labels=[_name(area) for area in areas],
