@@ -167,6 +167,8 @@ def _topologies(name: str, worlds: Sequence[WorldBelief]) -> Iterator[Metric]:
     own = [world.placement for world in worlds]
     yield from _placements(name, own, _RIGHT_TOLERANCE)
     yield from _placements(f"{name}/alone", [each.placement for each in alone], None)
+    if greedy := [w.placement_greedy for w in worlds if w.placement_greedy is not None]:
+        yield from _placements(f"{name}/greedy", greedy, None)
     if peers := [world.placement_peer for world in worlds if world.placement_peer is not None]:
         yield from _placements(f"{name}/kiss_slam", peers, None)
     returns = float(sum(world.true_returns for world in worlds))

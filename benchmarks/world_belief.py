@@ -16,6 +16,7 @@ import numpy as np
 from pydantic import TypeAdapter
 
 from benchmarks.calibration import normalised_error
+from benchmarks.greedy import greedy_poses
 from benchmarks.scoring import (
     Decision,
     Journey,
@@ -33,6 +34,7 @@ from hmt_service.core.engine import Engine
 from hmt_service.core.geometry import FloatArray, Pose, identity, inverse
 from hmt_service.core.odometry import Odometry
 from hmt_service.core.stored import StoredMap
+from hmt_service.core.submap import visit_of
 from hmt_service.core.types import (
     Event,
     EventKind,
@@ -88,6 +90,8 @@ class WorldBelief:
     """How it places the keyframes that return."""
     placement_odometry: Placement
     """How the motions from keyframe to keyframe alone place them."""
+    placement_greedy: Placement | None
+    """How a chain does that commits to the best fit, on the same odometry; None in 3-D."""
     placement_peer: Placement | None
     """How KISS-SLAM does, from the scans alone; None where it has not run."""
     decisions: tuple[Decision, ...]
@@ -163,7 +167,7 @@ class _Record:
         return Alone(
             false_loops=verdicts.count(Verdict.FALSE_LOOP),
             missed_loops=verdicts.count(Verdict.MISSED_LOOP),
-            placement=placement(journey, _poses(topology, journey)),
+            placement=_placement(journey, topology.reference_from_visit),
             engine_s=engine_s,
             engine_alone_s=engine_alone_s,
         )
@@ -220,7 +224,7 @@ def believe(
     beside = record.alone(
         alone.engine.stored(), engine_s=timed.spent_s, engine_alone_s=alone.spent_s
     )
-    belief = _belief(stored, built, record, beside, is_planar=config.sensor.is_planar)
+    belief = _belief(stored, built, record, beside, config)
     if peer is None:
         return belief
     stamps_s = np.array([keyframe.stamp_s for keyframe in stored.keyframes])
@@ -256,8 +260,9 @@ def topologies_of(stored: StoredMap) -> tuple[Topology, ...]:
 
 
 def _belief(
-    stored: StoredMap, built: GlobalMap, record: _Record, alone: Alone, *, is_planar: bool
+    stored: StoredMap, built: GlobalMap, record: _Record, alone: Alone, config: Config
 ) -> WorldBelief:
+    is_planar = config.sensor.is_planar
     journey, topologies = record.journey(stored), topologies_of(stored)
     verdicts = [judge_all(journey, topology) for topology in topologies]
     is_right = [set(each) == {Verdict.RIGHT} for each in verdicts]
@@ -275,8 +280,9 @@ def _belief(
         false_loops=verdicts[0].count(Verdict.FALSE_LOOP),
         missed_loops=verdicts[0].count(Verdict.MISSED_LOOP),
         alone=alone,
-        placement=placement(journey, _poses(topologies[0], journey)),
+        placement=_placement(journey, topologies[0].reference_from_visit),
         placement_odometry=placement(journey, _chained(stored.keyframes)),
+        placement_greedy=_placement(journey, _greedy(stored, config)) if is_planar else None,
         placement_peer=None,
         decisions=tuple(record.decisions),
         decisions_always_new=tuple(always_new(journey, visit) for visit in visits),
@@ -298,13 +304,22 @@ def _chained(keyframes: Sequence[Keyframe]) -> FloatArray:
     return np.array(poses)
 
 
-def _poses(topology: Topology, journey: Journey) -> FloatArray:
-    """Return the pose of each keyframe in the map of a hypothesis, shape (K, 4, 4)."""
+def _placement(journey: Journey, reference_from_visit: FloatArray) -> Placement:
+    """Return how the keyframes are placed if the visits, shape (V, 4, 4), are there."""
     visits = (
         np.searchsorted(journey.first_keyframe, np.arange(len(journey.place)), side="right") - 1
     )
-    poses: FloatArray = topology.reference_from_visit[visits] @ journey.visit_from_keyframe
-    return poses
+    return placement(journey, reference_from_visit[visits] @ journey.visit_from_keyframe)
+
+
+def _greedy(stored: StoredMap, config: Config) -> FloatArray:
+    """Return where a greedy chain puts the visits of a map, shape (V, 4, 4)."""
+    keyframes = stored.keyframes
+    visits = [
+        visit_of(v.visit, keyframes[v.first_keyframe : v.last_keyframe + 1], config)
+        for v in stored.visits
+    ]
+    return greedy_poses(visits, config)
 
 
 def _odometry_errors(stored: StoredMap, journey: Journey, *, is_planar: bool) -> Iterator[float]:

@@ -59,6 +59,7 @@ def world(
         ),
         placement=Placement(10, 10 if is_right else 4),
         placement_odometry=Placement(10, 5),
+        placement_greedy=Placement(10, 2) if is_planar else None,
         placement_peer=None if is_planar else Placement(10, 10),
         decisions=tuple(decisions),
         decisions_always_new=tuple(
@@ -124,6 +125,8 @@ def test_the_numbers_of_a_report(tmp_path: Path) -> None:
     assert values["all/all_placed_right"] == 0.5
     assert values["all/alone/placed_right"] == pytest.approx(0.3)
     assert values["all/alone/all_placed_right"] == 0.0
+    assert values["all/greedy/placed_right"] == pytest.approx(0.2)
+    assert values["all/greedy/all_placed_right"] == 0.0
     assert "all/kiss_slam/placed_right" not in values
     assert values["all/decisions"] == 7
     assert values["all/brier"] == pytest.approx((0.04 + 0.81) / 7)
@@ -158,6 +161,7 @@ def test_what_has_no_value_is_said(tmp_path: Path) -> None:
     values = {metric.key: metric.value for metric in report.metrics}
     assert "nees_3d/odometry/mean" in values
     assert values["garage/kiss_slam/all_placed_right"] == 1.0
+    assert "garage/greedy/placed_right" not in values
 
 
 def test_figures_are_drawn(tmp_path: Path) -> None:

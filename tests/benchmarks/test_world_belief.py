@@ -78,7 +78,7 @@ def test_the_map_places_what_returns_and_drifting_motions_alone_do_worse() -> No
     assert placed == Placement(placed.returning, placed.returning)
     assert chained.returning == placed.returning > 20
     assert chained.right <= placed.right
-    assert closed_ring().placement_peer == placed
+    assert closed_ring().placement_greedy == closed_ring().placement_peer == placed
 
 
 def test_poses_of_a_right_map_are_about_as_wrong_as_they_say() -> None:
