@@ -10,6 +10,7 @@ References:
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -46,7 +47,7 @@ from hmt_service.core.storing import (
     stored_visits,
 )
 from hmt_service.core.submap import News, Visit, as_points, visit_of
-from hmt_service.core.transition import Successor, Transition
+from hmt_service.core.transition import Places, Successor, Transition
 from hmt_service.core.types import (
     NO_POINTS,
     ArcResidual,
@@ -102,6 +103,7 @@ class Engine:
         self._scans = ScanLog()
         self._tracked: Counter[str] = Counter()
         self._weighed: dict[int, dict[int, float]] = {}
+        self._doubted: list[int] = []
         self._next_hypothesis = 0
         self._revision = 0
         self._finished_revision = 0
@@ -322,7 +324,7 @@ class Engine:
         refined = self._refined(visit, stamp_s)
         forgotten = self._forget(stamp_s)
         recognised = self._recognise(visit, stamp_s)
-        self._forget_visit(visit.visit - 1)
+        self._forget_visits(visit.visit - 1)
         return (*refined, *forgotten, *recognised)
 
     def _refined(self, visit: Visit, stamp_s: float) -> tuple[Event, ...]:
@@ -344,26 +346,21 @@ class Engine:
     def _recognise(self, visit: Visit, stamp_s: float) -> tuple[Event, ...]:
         """Branch over where else in the map what a finished visit has seen may be."""
         known = self._particles.hypotheses
-        recognising, branched = [], []
+        recognising: list[Hypothesis] = []
+        branched: list[Event] = []
+        log_resemblance = None
         for hypothesis in known:
-            for match in self._transition.recognitions(hypothesis, visit, self._visits):
-                place = match.area_from_visit
-                if match.area is None or place is None:
-                    continue
-                if any(h.has_recognised(hypothesis, match.area, place.mean) for h in known):
-                    continue
-                child = hypothesis.recognising(
-                    match.area,
-                    place,
-                    is_same_area=match.overlap >= SAME_AREA,
-                    hypothesis=self._new_identifier(),
-                    log_weight=hypothesis.log_weight + match.log_factor,
-                )
+            places = self._transition.recognitions(hypothesis, visit, self._visits)
+            new = [s for s in places.successors if not _is_recognised(known, hypothesis, s)]
+            if places.is_searched and log_resemblance is None:
+                log_resemblance = places.log_resemblance(new)
+            for match in new:
+                child = _recognised(hypothesis, match, self._new_identifier())
                 recognising.append(child)
                 branched.append(audit.branched(hypothesis, child, match, stamp_s))
         if not recognising:
             return ()
-        pruned = self._particles.replace([*known, *recognising])
+        pruned = self._particles.replace([*_resembling(known, log_resemblance), *recognising])
         return (*branched, *audit.pruned(pruned, stamp_s))
 
     def _expand(
@@ -371,24 +368,33 @@ class Engine:
     ) -> tuple[list[Hypothesis], list[Event]]:
         """Return one hypothesis per hypothesis and place that the visit may be to, Eq. (6)."""
         expanded, branched = [], []
-        for hypothesis in self._particles.hypotheses:
-            successors = self._transition.successors(hypothesis, visit, arc, self._visits)
-            for successor in successors:
+        known = self._particles.hypotheses
+        found = [self._transition.successors(h, visit, arc, self._visits) for h in known]
+        for hypothesis, places in zip(known, found, strict=True):
+            for successor in places.successors:
                 # One successor is no branch: what was believed goes on.
-                is_branch = len(successors) > 1
+                is_branch = len(places.successors) > 1
                 identifier = self._new_identifier() if is_branch else hypothesis.hypothesis
                 child = _entered(hypothesis, visit.visit, arc, successor, identifier)
                 expanded.append(child)
                 if is_branch:
                     branched.append(audit.branched(hypothesis, child, successor, stamp_s))
-        return expanded, branched
+        return _resembling(expanded, _log_resemblance(known, found)), branched
 
     def _weigh(self, keyframe: Keyframe) -> tuple[Event, ...]:
         """Multiply the weights by the predictive likelihood of a keyframe, Eq. (12)."""
         if len(self._particles.hypotheses) == 1:
             return ()
+        hypotheses = self._particles.hypotheses
         news = self._open.news_of(len(self._open.keyframes) - 1)
-        evidence = {h.hypothesis: self._evidence(h, news) for h in self._particles.hypotheses}
+        evidence = {h.hypothesis: self._evidence(h, news) for h in hypotheses}
+        if found := [h for h in hypotheses if h.is_found]:
+            # A new area that looks like a known one looks like each as probably as it is that one.
+            before = np.array([h.log_weight for h in found])
+            after = before + [evidence[h.hypothesis] for h in found]
+            like = float(np.logaddexp.reduce(after) - np.logaddexp.reduce(before))
+            unlike = [h for h in hypotheses if h.log_unlike is not None]
+            evidence |= {h.hypothesis: h.log_likelihood_of_like(like) for h in unlike}
         self._weighed[keyframe.index] = evidence
         dropped = self._particles.reweight(lambda h: evidence[h.hypothesis])
         return audit.pruned(dropped, keyframe.stamp_s)
@@ -411,15 +417,26 @@ class Engine:
         self._weighed.clear()
         self._particles.reweight(lambda h: -sum(said.get(h.hypothesis, 0.0) for said in taken_back))
 
+    def _forget_visits(self, last: int) -> None:
+        """Forget a visit, and those that were in doubt until now, if they show nothing new.
+
+        All hypotheses must agree that a visit did not found an area: what founders saw is compared
+        with.
+        """
+        hypotheses, asked = self._particles.hypotheses, (*self._doubted, last)
+        founded = {v: [v in h.topology.areas for h in hypotheses] for v in asked if v >= 0}
+        self._doubted = [v for v, each in founded.items() if any(each) and not all(each)]
+        for visit, each in founded.items():
+            if not any(each):
+                self._forget_visit(visit)
+
     def _forget_visit(self, visit: int) -> None:
         """Keep the path only of a visit that shows nothing new of an area that is well known.
 
-        All hypotheses must agree that it did not found one: what founders saw is compared with.
         The visits before and after it must have been refined, so that no arc to it is to come.
         """
         best, hypotheses = self._particles.best, self._particles.hypotheses
-        is_frozen = visit < self._frozen_visits
-        if visit < 0 or is_frozen or any(visit in h.topology.areas for h in hypotheses):
+        if visit < self._frozen_visits:
             return
         to_same = best.topology.visits_to[best.topology.assignments[visit].area]
         others = [v for v in to_same if v != visit and not self._visits.is_forgotten(v)]
@@ -704,13 +721,71 @@ def _entered(
     log_weight = hypothesis.log_weight + successor.log_factor
     extended = partial(hypothesis.extended, arc=arc, hypothesis=identifier, log_weight=log_weight)
     if area is None or place is None:
-        return extended(new)
+        return replace(extended(new), look_alike_share=successor.look_alike_share)
     if area != hypothesis.current.area or successor.overlap >= SAME_AREA:
-        return extended(Assignment(visit, area, place, is_carried))
+        known = extended(Assignment(visit, area, place, is_carried))
+        return replace(known, is_found=known.is_found or successor.is_found)
     # Who only sees into the area that he was in has left it.
     return extended(new).recognising(
-        area, place, is_same_area=False, hypothesis=identifier, log_weight=log_weight
+        area,
+        place,
+        is_same_area=False,
+        is_found=successor.is_found,
+        hypothesis=identifier,
+        log_weight=log_weight,
     )
+
+
+def _is_recognised(
+    hypotheses: Sequence[Hypothesis], hypothesis: Hypothesis, match: Successor
+) -> bool:
+    """Return whether there is a hypothesis already that another one has this place in the map."""
+    area, place = match.area, match.area_from_visit
+    assert area is not None, "new areas are not recognised"
+    assert place is not None, "known areas have a place"
+    return any(h.has_recognised(hypothesis, area, place.mean) for h in hypotheses)
+
+
+def _recognised(hypothesis: Hypothesis, match: Successor, identifier: int) -> Hypothesis:
+    """Return a hypothesis whose last visit is where a match says."""
+    assert match.area is not None, "new areas are not recognised"
+    assert match.area_from_visit is not None, "known areas have a place"
+    return hypothesis.recognising(
+        match.area,
+        match.area_from_visit,
+        is_same_area=match.overlap >= SAME_AREA,
+        is_found=match.is_found,
+        hypothesis=identifier,
+        log_weight=hypothesis.log_weight_of_unlike + match.log_factor,
+    )
+
+
+def _resembling(
+    hypotheses: Sequence[Hypothesis], log_resemblance: float | None
+) -> list[Hypothesis]:
+    """Let new areas look like known ones, if it was found out how well those would do."""
+    if log_resemblance is None:
+        return list(hypotheses)
+    return [hypothesis.resembling(log_resemblance) for hypothesis in hypotheses]
+
+
+def _log_resemblance(hypotheses: Sequence[Hypothesis], found: Sequence[Places]) -> float | None:
+    """Return how well a new visit is explained by what looks like it, if anybody knows.
+
+    A wing that looks like another does so room after room: what those hypotheses expect that have
+    found the robot by its looks is what it would look like, too.
+    """
+    searched = (p.log_resemblance(p.successors) for p in found if p.is_searched)
+    told = [
+        (h.log_weight, np.logaddexp.reduce([s.log_factor for s in places.successors]))
+        for h, places in zip(hypotheses, found, strict=True)
+        if h.is_found
+    ]
+    if not told:
+        return next(searched, None)
+    log_weights, explained = np.array(told).T
+    expected = np.logaddexp.reduce(log_weights + explained) - np.logaddexp.reduce(log_weights)
+    return max(float(expected), next(searched, -math.inf))
 
 
 def _means(placed: GlobalMap) -> Mapping[int, Pose]:

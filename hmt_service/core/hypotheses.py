@@ -112,6 +112,13 @@ class Hypothesis:
     """Number of areas entered since it was likely."""
     sees: int | None = None
     """Older area that the visit, to a new one, sees into."""
+    is_found: bool = False
+    """Whether nothing but what the robot has seen says where in the map it is since it was lost."""
+    look_alike_share: float = 0.0
+    """Prior probability that a last visit to a new area is to one that looks like a known one."""
+    log_unlike: float | None = None
+    """Log of the probability that the last visit, to a new area, is to one that looks like nothing
+    that is known; None if nobody has looked."""
 
     @property
     def current(self) -> Assignment:
@@ -167,7 +174,9 @@ class Hypothesis:
         for each in sorted(arcs, key=lambda factor: is_anywhere(factor.a_from_b)):
             graph.fuse_factor(each)
         topology = self.topology.with_visit(assignment)
-        return Hypothesis(hypothesis, log_weight, topology, graph, self.unlikely_for)
+        return Hypothesis(
+            hypothesis, log_weight, topology, graph, self.unlikely_for, is_found=self.is_found
+        )
 
     def recognising(
         self,
@@ -175,6 +184,7 @@ class Hypothesis:
         area_from_visit: GaussianPose,
         *,
         is_same_area: bool,
+        is_found: bool,
         hypothesis: int,
         log_weight: float,
     ) -> Hypothesis:
@@ -184,6 +194,7 @@ class Hypothesis:
             area: The older area.
             area_from_visit: Where the visit is in it.
             is_same_area: Whether the visit was to that area, and not to one that sees into it.
+            is_found: Whether nothing but what it saw says so.
             hypothesis: Identifier of the successor.
             log_weight: Its log weight, not normalised.
         """
@@ -193,7 +204,56 @@ class Hypothesis:
             assignment = replace(self.current, area=area, area_from_visit=area_from_visit)
             topology = topology.with_visit(assignment)
         sees = None if is_same_area else area
-        return Hypothesis(hypothesis, log_weight, topology, graph, self.unlikely_for, sees)
+        return Hypothesis(
+            hypothesis, log_weight, topology, graph, self.unlikely_for, sees, is_found
+        )
+
+    def resembling(self, log_resemblance: float) -> Hypothesis:
+        """Return this hypothesis if a last visit to a new area may be to one like those known.
+
+        p(z | new) is that of the background only for some of the places that are new; others look
+        like places that are known, and which of these the visit resembles is not yet known.
+
+        Args:
+            log_resemblance: Log of the sum of p(z | x) / p0(z), for all of the visit, over those of
+                the places that it may look like that have not been thought of before, each times
+                its share of them.
+        """
+        if self.current.area != self.current.visit or self.sees is not None:
+            return self
+        log_plain, share = self.log_weight_of_unlike, self.look_alike_share
+        log_unlike = log_plain + math.log1p(-share)
+        log_before = log_unlike if self.log_unlike is None else self.log_weight
+        log_like = math.log(share) + log_resemblance if share > 0.0 else -math.inf
+        log_weight = float(np.logaddexp(log_before, log_plain + log_like))
+        return replace(self, log_weight=log_weight, log_unlike=log_unlike - log_weight)
+
+    @property
+    def log_weight_of_unlike(self) -> float:
+        """The log weight if new places looked like nothing that is known."""
+        if self.log_unlike is None:
+            return self.log_weight
+        return self.log_weight + self.log_unlike - math.log1p(-self.look_alike_share)
+
+    def log_likelihood_of_like(self, log_likelihood: float) -> float:
+        """Return log p(z) / p0(z) of a new area.
+
+        Args:
+            log_likelihood: The same of the known areas that it may look like.
+        """
+        if self.log_unlike is None:
+            return 0.0
+        like = -math.expm1(self.log_unlike)
+        log_like = math.log(like) if like > 0.0 else -math.inf
+        return float(np.logaddexp(self.log_unlike, log_like + log_likelihood))
+
+    def weighed(self, log_likelihood: float) -> Hypothesis:
+        """Return this hypothesis after an observation; a negative one takes it back."""
+        log_unlike = self.log_unlike
+        if log_unlike is not None:
+            # What speaks for it was predicted by the places that it looks like, and by no others.
+            log_unlike = min(log_unlike - log_likelihood, 0.0)
+        return replace(self, log_weight=self.log_weight + log_likelihood, log_unlike=log_unlike)
 
     def without(self, visit: int) -> Hypothesis:
         """Return this hypothesis with what a visit says in the arcs of its area (section IV-D)."""
@@ -317,9 +377,7 @@ class ParticleLayer:
 
     def reweight(self, log_likelihood: Callable[[Hypothesis], float]) -> tuple[Hypothesis, ...]:
         """Multiply each weight by the predictive likelihood of an observation; see `replace`."""
-        return self.replace(
-            [replace(h, log_weight=h.log_weight + log_likelihood(h)) for h in self._hypotheses]
-        )
+        return self.replace([h.weighed(log_likelihood(h)) for h in self._hypotheses])
 
     def merge(self) -> tuple[Hypothesis, ...]:
         """Keep one of hypotheses that differ only in the name of a place, with the mass of all.

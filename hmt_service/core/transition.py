@@ -7,7 +7,7 @@ References:
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -17,6 +17,7 @@ from hmt_service.core.alignment import Aligner, Mode
 from hmt_service.core.awakening import anywhere_in, beside_keyframes, is_anywhere, put_down
 from hmt_service.core.config import Config
 from hmt_service.core.geometry import (
+    ANY_HEADING_RAD,
     PLANAR_AXES,
     FloatArray,
     GaussianPose,
@@ -51,6 +52,38 @@ class Successor:
     """Log of the probability of entering here times that of the observations, up to a constant."""
     is_carried: bool = False
     """Whether the robot was carried there: the motion since the visit before says nothing."""
+    is_found: bool = False
+    """Whether nothing leads there but what the visit saw."""
+    look_alike_share: float = 0.0
+    """Prior probability that a new area looks like a known one."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Places:
+    """Where a visit may be."""
+
+    successors: tuple[Successor, ...]
+    """One for each place."""
+    log_searched: float = -math.inf
+    """Log of the prior probability of all places that were searched although nothing leads there,
+    in the unit of the successors' factors."""
+
+    @property
+    def is_searched(self) -> bool:
+        """Whether any was."""
+        return self.log_searched > -math.inf
+
+    def log_resemblance(self, successors: Iterable[Successor]) -> float:
+        """Return how well places explain the visit that were searched although nothing leads there.
+
+        Args:
+            successors: Some of them; those that do not explain it well were not.
+
+        Returns:
+            Log of the sum of p(z | x) / p0(z), each times its share of all that were searched.
+        """
+        told = [successor.log_factor for successor in successors if successor.is_found]
+        return float(np.logaddexp.reduce(told, initial=-np.inf)) - self.log_searched
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,16 +97,29 @@ class _Question:
     """The visit that the motion is from."""
     known_from_visit: GaussianPose
     visits: Visits
+    is_carried: bool = False
+    """Whether the robot was carried since then."""
 
     @property
     def is_open(self) -> bool:
         """Whether the motion says nothing."""
         return is_anywhere(self.known_from_visit)
 
+    @property
+    def is_heading_known(self) -> bool:
+        """Whether the motion says more than how far the robot may have come."""
+        return bool(self.known_from_visit.sigma_rad < ANY_HEADING_RAD)
+
     @cached_property
     def part(self) -> frozenset[int]:
         """Visits whose place beside the visit follows from the motion."""
         return frozenset() if self.is_open else self.hypothesis.graph.part_of(self.known)
+
+    @property
+    def is_near(self) -> bool:
+        """Whether it was carried into this part of the map, and not across a whole site."""
+        assignments = self.hypothesis.topology.assignments
+        return self.is_carried or (bool(self.part) and assignments[min(self.part)].is_carried)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -106,6 +152,8 @@ class Transition:
             rng: Source of the samples of the prior.
         """
         self._config = config.transition
+        self._log_unlikely = math.log(config.particles.unlikely_mass)
+        self._least_outside = 1.0 / (config.transition.prior_samples + 1)
         self._refinement = config.refinement
         self._beams = config.observation
         self._sigma_submap_m = config.covariance.sigma_submap_m
@@ -117,7 +165,7 @@ class Transition:
 
     def successors(
         self, hypothesis: Hypothesis, visit: Visit, arc: Factor, visits: Visits
-    ) -> tuple[Successor, ...]:
+    ) -> Places:
         """Return every place that the new visit may be to.
 
         Args:
@@ -136,13 +184,14 @@ class Transition:
         log_share = math.log(self._config.carried_share)
         log_rest = math.log1p(-self._config.carried_share)
         nothing = put_down(arc, is_planar=hypothesis.graph.is_planar)
-        # Nobody carries it across a whole site, and each area is searched in every heading.
-        most = self._config.max_carried_areas
-        carried = self._entries(hypothesis, visit, nothing, visits, most=most)
-        return (
-            *(replace(s, log_factor=s.log_factor + log_rest) for s in moved),
-            *(replace(s, log_factor=s.log_factor + log_share, is_carried=True) for s in carried),
+        carried = self._entries(hypothesis, visit, nothing, visits, is_carried=True)
+        rest = (replace(s, log_factor=s.log_factor + log_rest) for s in moved.successors)
+        share = (
+            replace(s, log_factor=s.log_factor + log_share, is_carried=True)
+            for s in carried.successors
         )
+        log_searched = np.logaddexp(moved.log_searched + log_rest, carried.log_searched + log_share)
+        return Places((*rest, *share), float(log_searched))
 
     def _entries(
         self,
@@ -151,21 +200,24 @@ class Transition:
         arc: Factor,
         visits: Visits,
         *,
-        most: int | None = None,
-    ) -> tuple[Successor, ...]:
+        is_carried: bool = False,
+    ) -> Places:
         """Return every place that the new visit may be to if the motion is to be believed."""
-        where = _Question(hypothesis, visit, arc.visit_a, arc.a_from_b, visits)
+        where = _Question(hypothesis, visit, arc.visit_a, arc.a_from_b, visits, is_carried)
         candidates = self._candidates(where)
         outside = self._mass_outside(candidates, visit, visits)
         # Who wakes up is in the map or outside; who has been outside goes on there.
         new = outside * self._config.outside_share if where.is_open else outside
-        candidates += self._anywhere(where, new, most)
-        successor = Successor(None, None, 0.0, float(np.log(new)))
-        return (successor, *self._matches(visit, candidates, visits))
+        found = self._found(where, new)
+        matches = self._matches(visit, candidates, visits)
+        # What is new where all is known has changed, and looks like no other place for that. Of who
+        # does not know how he went the bound of his speed says too much already: far away is new.
+        is_new_space = outside > self._least_outside and (where.is_open or where.is_heading_known)
+        share = self._config.look_alike_share if is_new_space else 0.0
+        successor = Successor(None, None, 0.0, float(np.log(new)), look_alike_share=share)
+        return Places((successor, *matches, *found.successors), found.log_searched)
 
-    def recognitions(
-        self, hypothesis: Hypothesis, visit: Visit, visits: Visits
-    ) -> tuple[Successor, ...]:
+    def recognitions(self, hypothesis: Hypothesis, visit: Visit, visits: Visits) -> Places:
         """Return where else what a finished visit to a new area has seen may be in the map.
 
         Its beginning told nothing; now all of it is known, what was seen through doors included.
@@ -177,12 +229,26 @@ class Transition:
             visits: All visits up to and including it.
         """
         if hypothesis.current.area_from_visit is not None:
-            return ()
+            return Places(())
         where = _Question(hypothesis, visit, visit.visit, certain(identity()), visits)
         candidates = self._candidates(
             where, is_asked=lambda prior: not is_certain(prior, self._refinement)
         )
-        return self._matches(visit, [*candidates, *self._anywhere(where, 1.0)], visits)
+        matches, found = self._matches(visit, candidates, visits), self._found(where, 1.0)
+        return Places((*matches, *found.successors), found.log_searched)
+
+    def _found(self, where: _Question, outside: float) -> Places:
+        """Return the places that nothing leads to but what the visit saw."""
+        # A search of the map costs more than all else, and what is unlikely is soon forgotten.
+        is_asked = where.hypothesis.log_weight >= self._log_unlikely
+        candidates = self._anywhere(where, outside) if is_asked else []
+        if not candidates:
+            return Places(())
+        matches = self._matches(where.visit, candidates, where.visits)
+        return Places(
+            tuple(replace(match, is_found=True) for match in matches),
+            math.log(sum(candidate.mass for candidate in candidates)),
+        )
 
     def _matches(
         self,
@@ -241,9 +307,7 @@ class Transition:
         is_known = not is_lost and is_certain(where.known_from_visit, self._refinement)
         return known if is_known and where.hypothesis.current.area == known else None
 
-    def _anywhere(
-        self, where: _Question, outside: float, most: int | None = None
-    ) -> list[_Candidate]:
+    def _anywhere(self, where: _Question, outside: float) -> list[_Candidate]:
         """Return the areas that the visit may be to because nobody knows where those are.
 
         A robot that wakes up is as likely beside one keyframe of the map as beside another, and may
@@ -252,11 +316,12 @@ class Transition:
         Args:
             where: What is asked.
             outside: Probability that it is in no area at all.
-            most: How many, those nearest to where the robot was; None for all.
         """
         visits, share = where.visits, self._config.outside_share
         areas = [area for area in where.hypothesis.topology.areas if area not in where.part]
-        if most is not None and len(areas) > most:
+        most = self._config.max_carried_areas
+        if where.is_near and len(areas) > most:
+            # Each is searched in every heading.
             positions = where.hypothesis.graph.poses()[:, :3, 3]
             away_m = np.linalg.norm(positions[areas] - positions[where.known], axis=1)
             areas = [areas[i] for i in np.sort(np.argsort(away_m, kind="stable")[:most])]
@@ -289,7 +354,7 @@ class Transition:
             known = np.array([p.mean[:3, 3] for p in visits[candidate.area].visit_from_keyframe])
             distances = np.linalg.norm(positions[:, None] - known[None], axis=2).min(axis=1)
             inside += float(np.mean(distances <= self._config.presence_m))
-        return float(np.clip(1.0 - inside, 1.0 / (samples + 1), samples / (samples + 1)))
+        return float(np.clip(1.0 - inside, self._least_outside, 1.0 - self._least_outside))
 
     def _log_factor(self, visit: Visit, target: Visit, candidate: _Candidate, mode: Mode) -> float:
         """Return the log of the Laplace integral of prior times likelihood around one mode."""

@@ -283,7 +283,9 @@ def test_recognised_visit_is_tied_and_may_keep_its_area(is_same_area: bool) -> N
     arc = Factor(2, 3, gaussian(planar_pose(5.0, 0.0, 0.0), sigma_m=1.0))
     new = travelled().extended(Assignment(3, 3, None), arc, hypothesis=3, log_weight=0.0)
     place = gaussian(planar_pose(0.7, 0.0, 0.0), sigma_m=0.01)
-    known = new.recognising(1, place, is_same_area=is_same_area, hypothesis=4, log_weight=-1.0)
+    known = new.recognising(
+        1, place, is_same_area=is_same_area, is_found=True, hypothesis=4, log_weight=-1.0
+    )
     assert known.topology.areas == ((0, 1) if is_same_area else (0, 1, 3))
     assert known.graph.relative(1, 3).mean[0, 3] == pytest.approx(0.7, abs=0.01)
     assert new.graph.relative(1, 3).mean[0, 3] != pytest.approx(0.7, abs=0.05)
@@ -297,3 +299,38 @@ def test_recognised_visit_is_tied_and_may_keep_its_area(is_same_area: bool) -> N
     assert known.has_recognised(new, 1, place.mean)
     assert not new.has_recognised(new, 1, place.mean)
     assert not known.has_recognised(new, 1, planar_pose(2.7, 0.0, 0.0))
+
+
+def test_a_new_area_may_look_like_a_known_one() -> None:
+    arc = Factor(2, 3, gaussian(planar_pose(5.0, 0.0, 0.0), sigma_m=1.0))
+    new = travelled().extended(Assignment(3, 3, None), arc, hypothesis=3, log_weight=-1.0)
+    assert new.resembling(5.0).log_weight == -1.0
+    new = replace(new, look_alike_share=0.3)
+    told = new.resembling(5.0)
+    assert told.log_weight == pytest.approx(-1.0 + math.log(0.7 + 0.3 * math.exp(5.0)))
+    assert told.log_weight_of_unlike == pytest.approx(-1.0)
+    # Another place that it may look like is one more reason.
+    more = told.resembling(5.0)
+    assert more.log_weight == pytest.approx(-1.0 + math.log(0.7 + 0.6 * math.exp(5.0)))
+    assert more.log_weight_of_unlike == pytest.approx(-1.0)
+    # What it sees next is predicted by both: exactly what one by one predicts.
+    gained = more.log_likelihood_of_like(2.0)
+    after = more.weighed(gained)
+    assert after.log_weight == pytest.approx(-1.0 + math.log(0.7 + 0.6 * math.exp(7.0)))
+    assert after.log_weight_of_unlike == pytest.approx(-1.0)
+    back = after.weighed(-gained)
+    assert back.log_weight == pytest.approx(more.log_weight)
+    assert back.log_weight_of_unlike == pytest.approx(-1.0)
+    # Nobody has looked in the next area yet.
+    onward = Factor(3, 4, gaussian(planar_pose(5.0, 0.0, 0.0)))
+    entered = after.extended(Assignment(4, 4, None), onward, hypothesis=5, log_weight=0.0)
+    assert entered.log_likelihood_of_like(9.0) == 0.0
+
+
+@pytest.mark.parametrize("log_resemblance", [-1e4, 1e4])
+def test_what_resembles_nothing_or_all_is_no_overflow(log_resemblance: float) -> None:
+    arc = Factor(2, 3, gaussian(planar_pose(5.0, 0.0, 0.0), sigma_m=1.0))
+    new = travelled().extended(Assignment(3, 3, None), arc, hypothesis=3, log_weight=-1.0)
+    told = replace(new, look_alike_share=0.3).resembling(log_resemblance)
+    assert told.log_weight_of_unlike == pytest.approx(-1.0, abs=1e-9)
+    assert told.log_likelihood_of_like(-3.0) == pytest.approx(-3.0 if log_resemblance > 0 else 0.0)

@@ -60,7 +60,7 @@ def successors_of(
     rng = np.random.default_rng(seed)
     transition = Transition(CONFIG, aligner or Aligner(CONFIG), observation, rng)
     arc = Factor(len(visits) - 1, len(visits), gaussian(motion, sigma_m=sigma_m, sigma_rad=0.02))
-    return transition.successors(hypothesis, visit, arc, Visits(visits.values()))
+    return transition.successors(hypothesis, visit, arc, Visits(visits.values())).successors
 
 
 class NoAligner(Aligner):
@@ -190,7 +190,7 @@ def recognitions_of(sigma_m: float, path: Sequence[Pose]) -> tuple[Successor, ..
     arc = Factor(1, 2, gaussian(back, sigma_m=sigma_m, sigma_rad=0.02))
     hypothesis = hypothesis.extended(Assignment(2, 2, None), arc, hypothesis=1, log_weight=0.0)
     transition = Transition(CONFIG, Aligner(CONFIG), observation, np.random.default_rng(0))
-    return transition.recognitions(hypothesis, visit, Visits([*visits.values(), visit]))
+    return transition.recognitions(hypothesis, visit, Visits([*visits.values(), visit])).successors
 
 
 def test_finished_visit_is_recognised_where_its_place_is_in_doubt() -> None:
