@@ -22,8 +22,8 @@ from hmt_service.service.keys import DEFAULT_ENDPOINT
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from hmt_service.client import HmtClient
     from hmt_service.core.types import Belief, GlobalMap, Localization
-    from hmt_service.service.client import HmtClient
     from hmt_service.service.reports import Status
 
 Run = Annotated[
@@ -256,7 +256,7 @@ def compare(
 
 
 def _client(connect: str, site: str, robot: str, timeout_s: float) -> HmtClient:
-    from hmt_service.service.client import HmtClient
+    from hmt_service.client import HmtClient
 
     return HmtClient(connect, site=site, robot=robot, timeout_s=timeout_s)
 

@@ -22,16 +22,13 @@ from hmt_service.service.keys import DEFAULT_ENDPOINT
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from hmt_service.client import HmtClient
     from hmt_service.core.types import Reading
-    from hmt_service.service.client import HmtClient
     from hmt_service.service.reports import Status
 
 _FARTHEST_M = 1e6
 """Everything finite is sent: what is a return is the daemon's settings' business."""
-_CHECK_EVERY_BYTES = 1_000_000
 _POLL_S = 0.1
-_MOST_QUEUED_BYTES = 64_000_000
-"""The sender waits while more than this waits at the daemon, which drops what it cannot hold."""
 
 
 def replay(
@@ -50,8 +47,8 @@ def replay(
     """Send a recorded log to a daemon, and wait for the map."""
     from rich.console import Console
 
+    from hmt_service.client import HmtClient
     from hmt_service.io.logs import read_log
-    from hmt_service.service.client import HmtClient
 
     console = Console(stderr=True)
     with HmtClient(connect, site=site, robot=robot) as client:
@@ -97,14 +94,11 @@ def replay_readings(
     from hmt_service.core.types import Scan
 
     before = client.status()
-    sent = scans = unchecked = 0
+    sent = scans = 0
     with Progress(console=console) as progress:
         sending = progress.add_task("sending", total=total)
         for reading in _paced(readings, rate):
-            if unchecked > _CHECK_EVERY_BYTES:
-                _wait_for_room(client)
-                unchecked = 0
-            unchecked += client.publish(reading)
+            client.publish(reading)
             sent += 1
             scans += isinstance(reading, Scan)
             progress.update(sending, completed=sent)
@@ -127,11 +121,6 @@ def _paced(readings: Iterable[Reading], rate: float | None) -> Iterator[Reading]
         due_s = zero_s + reading.stamp_s / rate
         time.sleep(max(0.0, due_s - time.monotonic()))
         yield reading
-
-
-def _wait_for_room(client: HmtClient) -> None:
-    while client.status().input.queued_bytes > _MOST_QUEUED_BYTES:
-        time.sleep(_POLL_S)
 
 
 def _finish(client: HmtClient, show: Callable[[int], None]) -> None:

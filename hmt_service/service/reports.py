@@ -77,6 +77,8 @@ class Status:
     """Keyframes in the map."""
     hypotheses: int
     """Hypotheses alive."""
+    hypothesis: int | None
+    """The best one; None before the first keyframe."""
     stored_keyframes: int
     """Keyframes that are in the map file, whatever happens now; zero without one."""
     localization: Localization | None

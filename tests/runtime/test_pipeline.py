@@ -15,18 +15,23 @@ from hmt_service.core.config import Config, load_config
 from hmt_service.core.engine import Engine
 from hmt_service.core.odometry import Odometry
 from hmt_service.core.types import Event, GlobalMap, MapMethod, Reading, Scan, Tracking
-from hmt_service.errors import DaemonFailure, DeadlineExceeded, NotFound, Unavailable
+from hmt_service.errors import DaemonFailure, DeadlineExceeded, HmtError, NotFound, Unavailable
 from hmt_service.runtime.messages import (
+    Answer,
     CompareRequest,
     Finish,
     Finished,
     Mapped,
     MapRequest,
+    Part,
     ProcessName,
     Request,
     Result,
     RunReport,
     SaveRequest,
+    Wire,
+    dump,
+    load,
 )
 from hmt_service.runtime.pipeline import Pipeline
 from tests.flat import SETTINGS, readings
@@ -79,19 +84,38 @@ class Recorder:
         return self.finished[-1]
 
 
-class Answers:
-    """Collects the one answer to a request."""
+def encode(answer: Answer) -> Wire:
+    """Stand for the messages of the service."""
+    return Wire(dump(answer), type(answer).__name__)
 
-    def __init__(self, pipeline: Pipeline, request: Request, timeout_s: float = DEADLINE_S) -> None:
-        self.results: list[Result] = []
+
+class Answers:
+    """Collects the one answer to a request, which may come in parts."""
+
+    def __init__(
+        self,
+        pipeline: Pipeline,
+        request: Request,
+        timeout_s: float = DEADLINE_S,
+        part_bytes: int | None = None,
+    ) -> None:
+        self.results: list[Answer | tuple[str, ...] | HmtError] = []
+        self.parts: list[Part] = []
         self._is_there = threading.Event()
-        pipeline.request(request, self._take, timeout_s=timeout_s)
+        pipeline.request(request, self._take, timeout_s=timeout_s, part_bytes=part_bytes)
 
     def _take(self, result: Result) -> None:
-        self.results.append(result)
+        if not isinstance(result, Part):
+            self.results.append(result)
+        else:
+            self.parts.append(result)
+            if not result.is_last:
+                return
+            assert [part.number for part in self.parts] == list(range(result.count))
+            self.results.append(load(b"".join(part.wire.payload for part in self.parts)))
         self._is_there.set()
 
-    def wait(self) -> Result:
+    def wait(self) -> Answer | tuple[str, ...] | HmtError:
         assert self._is_there.wait(DEADLINE_S)
         return self.results[0]
 
@@ -124,7 +148,7 @@ def config() -> Config:
 
 @pytest.fixture
 def running(config: Config) -> Iterator[Running]:
-    pipeline, recorder = Pipeline(config, save=save_area_count), Recorder()
+    pipeline, recorder = Pipeline(config, encode=encode, save=save_area_count), Recorder()
     pipeline.start(recorder)
     yield Running(pipeline, recorder)
     pipeline.stop(0.0)
@@ -245,7 +269,10 @@ def test_the_map_is_saved_before_it_is_smoothed(
     config: Config, tmp_path: Path, is_urgent: bool, saves: int
 ) -> None:
     log = tmp_path / "saved"
-    pipeline, recorder = Pipeline(config, save=partial(append_trajectory, log)), Recorder()
+    pipeline, recorder = (
+        Pipeline(config, encode=encode, save=partial(append_trajectory, log)),
+        Recorder(),
+    )
     pipeline.start(recorder)
     running = Running(pipeline, recorder)
     running.feed(readings(60))
@@ -262,7 +289,7 @@ def test_submit_returns_false_instead_of_waiting_for_a_dead_process(running: Run
 
 
 def test_a_map_that_cannot_be_saved_is_reported_and_kept(config: Config) -> None:
-    pipeline, recorder = Pipeline(config, save=fail_to_save), Recorder()
+    pipeline, recorder = Pipeline(config, encode=encode, save=fail_to_save), Recorder()
     pipeline.start(recorder)
     running = Running(pipeline, recorder)
     running.feed(readings(20))
@@ -294,7 +321,7 @@ def test_questions_without_end_do_not_stop_the_map(running: Running) -> None:
 
 
 def test_a_bug_in_an_answer_costs_the_answer_and_not_the_map(config: Config) -> None:
-    pipeline, recorder = Pipeline(config, save=stumble), Recorder()
+    pipeline, recorder = Pipeline(config, encode=encode, save=stumble), Recorder()
     pipeline.start(recorder)
     running = Running(pipeline, recorder)
     running.feed(readings(20))

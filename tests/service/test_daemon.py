@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hmt_service.client import HmtClient
 from hmt_service.core.config import load_config
 from hmt_service.core.engine import Engine
 from hmt_service.core.geometry import planar_pose
@@ -15,7 +16,6 @@ from hmt_service.core.odometry import Odometry
 from hmt_service.core.types import MapMethod, OdometryReading, Reading, Scan
 from hmt_service.errors import HmtError, InvalidInput, NotFound, Unavailable
 from hmt_service.io.trajectory import read_tum
-from hmt_service.service.client import HmtClient
 from hmt_service.service.codec import decode
 from hmt_service.service.keys import Input
 from hmt_service.service.readings import encode_reading
