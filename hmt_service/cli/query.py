@@ -320,7 +320,10 @@ def _draw(
     from hmt_service.viz.figures import draw_maps
 
     methods = [method] if method is not None else list(MapMethod)
-    maps = [client.map(m, reference=reference, hypothesis=hypothesis) for m in methods]
+    maps: list[GlobalMap] = []
+    for each in methods:
+        known = maps[0] if maps else None  # both maps have the same submaps
+        maps.append(client.map(each, reference=reference, hypothesis=hypothesis, known=known))
     comparison = client.compare(reference=reference, hypothesis=hypothesis)
     draw_maps(maps, comparison, path)
 

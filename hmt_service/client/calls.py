@@ -6,7 +6,7 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Generic, TypeVar
 
@@ -106,7 +106,7 @@ class Calls:
             known: A map fetched before: submaps that have not changed since are taken from it
                 instead of being sent again.
         """
-        areas = () if known is None else known.areas
+        submaps = _Known(() if known is None else known.areas)
         return Ask(
             self._keys.call(Call.MAP),
             GlobalMap,
@@ -115,10 +115,10 @@ class Calls:
                 "reference": reference,
                 "hypothesis": hypothesis,
                 "points": int(with_points),
-                "known": _versions_of(areas),
+                "known": submaps.parameter,
             },
             complete=lambda answer: replace(
-                answer, areas=tuple(_with_points(area, areas) for area in answer.areas)
+                answer, areas=tuple(map(submaps.put_into, answer.areas))
             ),
         )
 
@@ -148,7 +148,7 @@ class Calls:
             known: The area as it was fetched before: its points are not sent again if they have
                 not changed since.
         """
-        areas = () if known is None else (known,)
+        submaps = _Known(() if known is None else (known,))
         return Ask(
             self._keys.call(Call.AREA),
             AreaDetails,
@@ -157,9 +157,9 @@ class Calls:
                 "reference": reference,
                 "hypothesis": hypothesis,
                 "points": int(with_points),
-                "known": _versions_of(areas),
+                "known": submaps.parameter,
             },
-            complete=lambda answer: replace(answer, area=_with_points(answer.area, areas)),
+            complete=lambda answer: replace(answer, area=submaps.put_into(answer.area)),
         )
 
     def trajectory(
@@ -203,14 +203,18 @@ class Calls:
         return Ask(self._keys.control(Control.SHUTDOWN), Ack)
 
 
-def _versions_of(areas: tuple[PlacedArea, ...]) -> str | None:
-    """Return what submaps are known, in the words of the question."""
-    return ",".join(f"{area.area}:{area.version}" for area in areas if area.version) or None
+class _Known:
+    """The submaps that a client has."""
 
+    def __init__(self, areas: Iterable[PlacedArea]) -> None:
+        self._points = {(a.area, a.version): a.points_in_area for a in areas if a.version}
 
-def _with_points(area: PlacedArea, known: tuple[PlacedArea, ...]) -> PlacedArea:
-    """Return an area with the points that were left out because they are known."""
-    for before in known:
-        if area.version and (before.area, before.version) == (area.area, area.version):
-            return replace(area, points_in_area=before.points_in_area)
-    return area
+    @property
+    def parameter(self) -> str | None:
+        """What they are, in the words of the question; None if there is none."""
+        return ",".join(f"{area}:{version}" for area, version in self._points) or None
+
+    def put_into(self, area: PlacedArea) -> PlacedArea:
+        """Return an area with its points, if they were left out because they are known."""
+        points = self._points.get((area.area, area.version))
+        return area if points is None else replace(area, points_in_area=points)

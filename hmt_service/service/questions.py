@@ -25,6 +25,8 @@ DEADLINE, PART_BYTES = "deadline", "part_bytes"
 """Parameters of every call: s after which nobody waits for the answer any more, and the size of
 the largest part that it may come in."""
 _MOST_DEADLINE_S = 600.0
+_MOST_CHARACTERS = 1_000_000
+"""Length of all parameters: `known` of 50,000 areas."""
 _LEAST_PART_BYTES, _MOST_PART_BYTES = 16_384, 1_048_576
 _LOG = logging.getLogger(__name__)
 
@@ -54,7 +56,10 @@ class Question(Generic[Name]):
             raise InvalidInput(f"{query.key_expr} is several calls at once: {', '.join(meant)}")
         self.name = meant[0]
         self._key = keys[self.name]
-        pairs = [pair.partition("=") for pair in str(query.parameters).split(";") if pair]
+        text = str(query.parameters)
+        if len(text) > _MOST_CHARACTERS:
+            raise InvalidInput(f"{len(text)} characters of parameters, {_MOST_CHARACTERS} at most")
+        pairs = [pair.partition("=") for pair in text.split(";") if pair]
         # Names that begin with "_" belong to Zenoh.
         self._parameters = {name: text for name, _, text in pairs if not name.startswith("_")}
 

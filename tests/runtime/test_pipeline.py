@@ -10,6 +10,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from hmt_service.core.config import Config, load_config
 from hmt_service.core.engine import Engine
@@ -32,6 +34,7 @@ from hmt_service.runtime.messages import (
     Wire,
     dump,
     load,
+    parts_of,
 )
 from hmt_service.runtime.pipeline import Pipeline
 from tests.flat import SETTINGS, readings
@@ -226,6 +229,43 @@ def test_a_late_answer_is_an_error_and_the_next_one_belongs_to_its_question(
     running.finish()
     assert Answers(running.pipeline, SaveRequest()).wait() == ("1 areas of 20 scans",)
     assert len(late.results) == 1
+
+
+def test_an_answer_comes_in_parts_and_counts_once(running: Running) -> None:
+    running.feed(readings(20))
+    running.finish()
+    request = MapRequest(MapMethod.CONSISTENT)
+    pieces = [Answers(running.pipeline, request, part_bytes=1000) for _ in range(5)]
+    whole = Answers(running.pipeline, request)
+    expected = whole.wait()
+    assert isinstance(expected, GlobalMap)
+    assert len(whole.parts) == 1
+    for one in pieces:
+        answer = one.wait()
+        assert isinstance(answer, GlobalMap)
+        assert len(one.parts) > 2
+        assert all(len(part.wire.payload) <= 1000 for part in one.parts)
+        np.testing.assert_array_equal(
+            answer.areas[0].points_in_area, expected.areas[0].points_in_area
+        )
+
+
+def test_what_nobody_waits_for_any_more_is_not_worked_on(running: Running) -> None:
+    running.feed(readings(20))
+    running.finish()
+    late = Answers(running.pipeline, SaveRequest(), timeout_s=-1.0).wait()
+    assert isinstance(late, DeadlineExceeded)
+    assert "until its deadline" in str(late)
+
+
+@given(st.binary(max_size=50), st.integers(1, 60))
+def test_parts_joined_are_the_whole(payload: bytes, part_bytes: int) -> None:
+    parts = list(parts_of(Wire(payload, "bytes"), part_bytes))
+    assert b"".join(part.wire.payload for part in parts) == payload
+    assert [part.number for part in parts] == list(range(len(parts)))
+    assert {part.count for part in parts} == {len(parts)}
+    assert [part.is_last for part in parts] == [False] * (len(parts) - 1) + [True]
+    assert all(len(part.wire.payload) <= part_bytes for part in parts)
 
 
 def test_too_many_questions_at_once_are_refused(running: Running) -> None:
