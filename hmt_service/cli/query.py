@@ -335,6 +335,7 @@ def _status_rows(answer: Status) -> dict[str, str]:
         "received": f"{counts.received} samples",
         "accepted": f"{counts.accepted} readings, {counts.reordering} being ordered",
         "refused": _counted(counts.refused),
+        "lost": f"{sum(sender.lost for sender in answer.senders)} samples on their way",
         "waiting": f"{counts.queued} samples, {counts.queued_bytes / 1e6:.1f} MB",
         "dropped beams": _counted(counts.dropped_beams),
         "scans": f"{answer.tracked_scans} tracked, {answer.processed_scans} in the map",

@@ -106,7 +106,7 @@ def replay_readings(
             mapping = progress.add_task("mapping", total=scans)
             known = before.processed_scans
             _finish(client, lambda n: progress.update(mapping, completed=n - known))
-    _report(console, sent, before, client.status())
+    _report(console, sent, sum(client.lost().values()), before, client.status())
 
 
 def _paced(readings: Iterable[Reading], rate: float | None) -> Iterator[Reading]:
@@ -132,10 +132,9 @@ def _finish(client: HmtClient, show: Callable[[int], None]) -> None:
         show(ack.result().processed_scans)
 
 
-def _report(console: Console, sent: int, before: Status, after: Status) -> None:
-    received = after.input.received - before.input.received
-    if received < sent:
-        raise DaemonFailure(f"{sent - received} of {sent} readings did not reach the daemon")
+def _report(console: Console, sent: int, lost: int, before: Status, after: Status) -> None:
+    if lost:
+        raise DaemonFailure(f"{lost} of {sent} readings did not reach the daemon")
     new = Counter(after.input.refused) - Counter(before.input.refused)
     refused = ", ".join(f"{count} {reason}" for reason, count in new.items()) or "none"
     scans = after.processed_scans - before.processed_scans

@@ -7,7 +7,7 @@ References:
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Mapping
 from contextlib import suppress
 from functools import wraps
 from types import TracebackType
@@ -284,6 +284,14 @@ class AsyncHmtClient:
         # The network may take its time.
         await asyncio.to_thread(self._connected.put, name, message.payload, message.encoding)
         return len(message.payload)
+
+    async def lost(self) -> Mapping[Input, int]:
+        """Return how many of the readings published here never arrived.
+
+        None while the connection lasts; it comes back by itself, but what is sent meanwhile is
+        lost. What became of the others is in `status`: refused by reason, or in the map.
+        """
+        return self._connected.lost_in(await self.status())
 
     def _live(self, topic: Topic, kind: type[T], capacity: int) -> AsyncLive[T]:
         return AsyncLive(self._connected, self._connected.subscribe(topic, kind, capacity))

@@ -7,7 +7,7 @@ References:
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import wraps
 from types import TracebackType
 from typing import Concatenate, Generic, ParamSpec, Self, TypeVar
@@ -265,6 +265,14 @@ class HmtClient:
         name = Input.ODOMETRY if isinstance(reading, OdometryReading) else Input.SCAN
         self._connection.put(name, message.payload, message.encoding)
         return len(message.payload)
+
+    def lost(self) -> Mapping[Input, int]:
+        """Return how many of the readings published here never arrived.
+
+        None while the connection lasts; it comes back by itself, but what is sent meanwhile is
+        lost. What became of the others is in `status`: refused by reason, or in the map.
+        """
+        return self._connection.lost_in(self.status())
 
     def publish_raw(self, name: Input, payload: bytes, encoding: str) -> None:
         """Send any payload as a scan or as odometry; waits while the network is behind.

@@ -8,7 +8,9 @@ References:
 
 from __future__ import annotations
 
+import secrets
 import threading
+from collections.abc import Mapping
 from concurrent.futures import Future
 from typing import Generic, TypeVar, cast
 
@@ -18,7 +20,7 @@ from hmt_service.client.calls import Ask
 from hmt_service.client.feed import Feed
 from hmt_service.core.types import Posterior
 from hmt_service.errors import DeadlineExceeded, HmtError, InvalidInput, Unavailable
-from hmt_service.service.codec import PREFIX, decode, decode_place
+from hmt_service.service.codec import PREFIX, decode, decode_place, encode_origin
 from hmt_service.service.keys import Input, Keys, Topic
 from hmt_service.service.questions import DEADLINE, PART_BYTES
 from hmt_service.service.reports import Status
@@ -57,6 +59,8 @@ class Connection:
         endpoints = Endpoints(mode=Mode.CLIENT, connect=(endpoint,), timeout_s=waiting_s)
         self._session = open_session(endpoints)
         self._publishers: dict[Input, zenoh.Publisher] = {}
+        self._sender = 1 + secrets.randbelow(2**64 - 1)
+        self._sent = dict.fromkeys(Input, 0)
         self._feeds: list[tuple[Feed[object], zenoh.Subscriber[None]]] = []
         self._lock = threading.Lock()
 
@@ -94,7 +98,15 @@ class Connection:
         with self._lock:
             if name not in self._publishers:
                 self._publishers[name] = self._publisher(self.keys.input(name))
-        self._publishers[name].put(payload, encoding=encoding)
+            number = self._sent[name]
+            self._sent[name] = number + 1
+        origin = encode_origin(self._sender, number)
+        self._publishers[name].put(payload, encoding=encoding, attachment=origin)
+
+    def lost_in(self, status: Status) -> Mapping[Input, int]:
+        """Return how many of the readings sent so far had not arrived when this was said."""
+        received = {c.input: c.received for c in status.senders if c.sender == self._sender}
+        return {name: sent - received.get(name, 0) for name, sent in self._sent.items()}
 
     def subscribe(self, topic: Topic, kind: type[T], capacity: int) -> Feed[T]:
         """Return what is published from now on."""

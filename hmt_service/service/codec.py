@@ -45,7 +45,8 @@ from hmt_service.errors import (
     Unavailable,
 )
 from hmt_service.runtime.messages import Part, ProcessName, ProcessStatus, Wire
-from hmt_service.service.reports import Ack, DaemonState, InputCounts, Status
+from hmt_service.service.keys import Input
+from hmt_service.service.reports import Ack, DaemonState, InputCounts, SenderCounts, Status
 from hmt_service.service.v1 import hmt_pb2 as pb
 
 PREFIX = "application/protobuf;"
@@ -103,6 +104,25 @@ def decode(payload: bytes, encoding: str) -> Value | HmtError:
         return from_proto(message_type.FromString(payload))
     except (DecodeError, ValueError) as error:
         raise InvalidInput(f"{len(payload)} bytes are no {encoding}: {error}") from error
+
+
+def encode_origin(sender: int, number: int) -> bytes:
+    """Return what a sender attaches to a reading.
+
+    Args:
+        sender: Number that it has drawn for itself, in [1, 2^64).
+        number: Place of the reading among those that it sends under one key, from 0.
+    """
+    return pb.Origin(sender=sender, number=number).SerializeToString()
+
+
+def decode_origin(attachment: bytes) -> tuple[int, int] | None:
+    """Return sender and number of a reading; None if the attachment does not say them."""
+    try:
+        origin = pb.Origin.FromString(attachment)
+    except DecodeError:
+        return None
+    return (origin.sender, origin.number) if origin.sender else None
 
 
 def encode_place(part: Part) -> bytes:
@@ -515,6 +535,15 @@ def _status_to_proto(status: Status) -> pb.Status:
         localization=(
             None if status.localization is None else _localization_to_proto(status.localization)
         ),
+        senders=[
+            pb.SenderCounts(
+                sender=counts.sender,
+                input=counts.input,
+                received=counts.received,
+                lost=counts.lost,
+            )
+            for counts in status.senders
+        ],
     )
 
 
@@ -557,6 +586,10 @@ def _status(message: pb.Status) -> Status:
         stored_keyframes=message.stored_keyframes,
         localization=(
             _localization(message.localization) if message.HasField("localization") else None
+        ),
+        senders=tuple(
+            SenderCounts(counts.sender, Input(counts.input), counts.received, counts.lost)
+            for counts in message.senders
         ),
     )
 

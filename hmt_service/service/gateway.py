@@ -54,6 +54,7 @@ from hmt_service.service.intake import Intake, IntakeLimits
 from hmt_service.service.keys import Call, Control, Input, Keys, Topic
 from hmt_service.service.questions import Name, Question, receive
 from hmt_service.service.reports import Ack, DaemonState, Status
+from hmt_service.service.senders import Senders
 
 _LOG = logging.getLogger(__name__)
 _WARNINGS = (EventKind.PRESET_DOUBTED, EventKind.NOT_SAVED)
@@ -97,6 +98,7 @@ class Gateway:
         self._intake = Intake(config.sensor, limits, submit=pipeline.submit, finish=pipeline.finish)
         self._localizer = Localizer()
         self._deliveries = Deliveries()
+        self._senders = Senders()
         self._snapshot: Snapshot | None = None
         self._report = RunReport(0, 0.0, 0.0)
         self._audit = Audit(events=_KEPT_EVENTS, beliefs=_KEPT_BELIEFS)
@@ -210,6 +212,7 @@ class Gateway:
             hypothesis=snapshot.posterior.hypotheses[0].hypothesis if snapshot else None,
             stored_keyframes=self._report.stored_keyframes,
             localization=snapshot.localization if snapshot else None,
+            senders=self._senders.counts(),
         )
 
     def on_tracking(self, tracking: Tracking) -> None:
@@ -261,6 +264,8 @@ class Gateway:
     def _on_sample(self, sample: zenoh.Sample) -> None:
         name = str(sample.key_expr).rpartition("/")[2]
         is_known = sample.kind == zenoh.SampleKind.PUT and name in set(Input)
+        if is_known and sample.attachment is not None:
+            self._senders.note(Input(name), sample.attachment.to_bytes())
         self._intake.offer(
             Input(name) if is_known else None,
             len(sample.payload),

@@ -12,6 +12,7 @@ from enum import StrEnum
 
 from hmt_service.core.types import Localization
 from hmt_service.runtime.messages import ProcessStatus
+from hmt_service.service.keys import Input
 
 
 class DaemonState(StrEnum):
@@ -45,6 +46,20 @@ class InputCounts:
     """Accepted readings that wait for earlier ones to arrive."""
     dropped_beams: Mapping[str, int]
     """Single beams dropped from accepted scans, by reason."""
+
+
+@dataclass(frozen=True, slots=True)
+class SenderCounts:
+    """What arrived of one sender under one key."""
+
+    sender: int
+    """Number that it has drawn for itself."""
+    input: Input
+    """What it sends."""
+    received: int
+    """Samples that arrived."""
+    lost: int
+    """Samples before the last one of these that did not."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +98,8 @@ class Status:
     """Keyframes that are in the map file, whatever happens now; zero without one."""
     localization: Localization | None
     """How sure it is where the robot is; None before the first keyframe."""
+    senders: tuple[SenderCounts, ...]
+    """What arrived of senders that number what they send; of the last hundred."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,6 +23,7 @@ from hmt_service.core.types import EventKind, GlobalMap, OdometryReading, Readin
 from hmt_service.errors import DeadlineExceeded, InvalidInput, NotFound, Unavailable
 from hmt_service.io.trajectory import read_tum
 from hmt_service.service.codec import decode, decode_place
+from hmt_service.service.keys import Input
 from hmt_service.service.session import Endpoints, Mode, open_session
 from tests.flat import readings
 from tests.service.harness import DEADLINE_S, RunningDaemon, running_daemon, wait_until
@@ -236,6 +237,20 @@ def test_a_loop_and_an_event_are_waited_for(client: HmtClient, drive: Drive) -> 
     trip.join()
     client.finish()
     assert belief.hypotheses[0].loop_closures > known
+
+
+def test_a_sender_can_reconcile_what_it_has_sent(daemon: RunningDaemon, drive: Drive) -> None:
+    with daemon.client() as client, daemon.client() as other:
+        assert client.lost() == {Input.SCAN: 0, Input.ODOMETRY: 0}
+        before = client.status().input
+        for reading in drive.next(30):
+            client.publish(reading)
+            other.publish_raw(Input.SCAN, b"\xff", "text/plain")
+        assert client.lost() == {Input.SCAN: 0, Input.ODOMETRY: 0}
+        client.finish()
+        counts = client.status().input
+        assert counts.accepted - before.accepted == 60
+        assert counts.refused["wrong_encoding"] - before.refused.get("wrong_encoding", 0) == 60
 
 
 def test_a_daemon_is_waited_for_at_a_router() -> None:

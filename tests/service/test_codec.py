@@ -42,7 +42,8 @@ from hmt_service.errors import (
 )
 from hmt_service.runtime.messages import ProcessName, ProcessStatus
 from hmt_service.service.codec import Value, decode, encode
-from hmt_service.service.reports import Ack, DaemonState, InputCounts, Status
+from hmt_service.service.keys import Input
+from hmt_service.service.reports import Ack, DaemonState, InputCounts, SenderCounts, Status
 
 reals = st.floats(-1e6, 1e6)
 shares = st.floats(0.0, 1.0)
@@ -157,6 +158,9 @@ statuses = st.builds(
     st.none() | ids,
     ids,
     st.none() | localizations,
+    st.lists(
+        st.builds(SenderCounts, counts, st.sampled_from(Input), counts, counts), max_size=2
+    ).map(tuple),
 )
 acks = st.builds(Ack, counts, counts, counts, counts, st.lists(texts, max_size=3).map(tuple))
 

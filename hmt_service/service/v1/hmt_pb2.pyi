@@ -424,8 +424,28 @@ class InputCounts(_message.Message):
     dropped_beams: _containers.ScalarMap[str, int]
     def __init__(self, received: _Optional[int] = ..., accepted: _Optional[int] = ..., refused: _Optional[_Mapping[str, int]] = ..., queued: _Optional[int] = ..., queued_bytes: _Optional[int] = ..., discarded: _Optional[int] = ..., reordering: _Optional[int] = ..., dropped_beams: _Optional[_Mapping[str, int]] = ...) -> None: ...
 
+class Origin(_message.Message):
+    __slots__ = ("sender", "number")
+    SENDER_FIELD_NUMBER: _ClassVar[int]
+    NUMBER_FIELD_NUMBER: _ClassVar[int]
+    sender: int
+    number: int
+    def __init__(self, sender: _Optional[int] = ..., number: _Optional[int] = ...) -> None: ...
+
+class SenderCounts(_message.Message):
+    __slots__ = ("sender", "input", "received", "lost")
+    SENDER_FIELD_NUMBER: _ClassVar[int]
+    INPUT_FIELD_NUMBER: _ClassVar[int]
+    RECEIVED_FIELD_NUMBER: _ClassVar[int]
+    LOST_FIELD_NUMBER: _ClassVar[int]
+    sender: int
+    input: str
+    received: int
+    lost: int
+    def __init__(self, sender: _Optional[int] = ..., input: _Optional[str] = ..., received: _Optional[int] = ..., lost: _Optional[int] = ...) -> None: ...
+
 class Status(_message.Message):
-    __slots__ = ("version", "config_hash", "state", "uptime_s", "input", "tracked_scans", "processed_scans", "processes", "revision", "areas", "arcs", "keyframes", "hypotheses", "stored_keyframes", "localization", "hypothesis")
+    __slots__ = ("version", "config_hash", "state", "uptime_s", "input", "tracked_scans", "processed_scans", "processes", "revision", "areas", "arcs", "keyframes", "hypotheses", "stored_keyframes", "localization", "hypothesis", "senders")
     VERSION_FIELD_NUMBER: _ClassVar[int]
     CONFIG_HASH_FIELD_NUMBER: _ClassVar[int]
     STATE_FIELD_NUMBER: _ClassVar[int]
@@ -442,6 +462,7 @@ class Status(_message.Message):
     STORED_KEYFRAMES_FIELD_NUMBER: _ClassVar[int]
     LOCALIZATION_FIELD_NUMBER: _ClassVar[int]
     HYPOTHESIS_FIELD_NUMBER: _ClassVar[int]
+    SENDERS_FIELD_NUMBER: _ClassVar[int]
     version: str
     config_hash: str
     state: DaemonState
@@ -458,7 +479,8 @@ class Status(_message.Message):
     stored_keyframes: int
     localization: Localization
     hypothesis: int
-    def __init__(self, version: _Optional[str] = ..., config_hash: _Optional[str] = ..., state: _Optional[_Union[DaemonState, str]] = ..., uptime_s: _Optional[float] = ..., input: _Optional[_Union[InputCounts, _Mapping]] = ..., tracked_scans: _Optional[int] = ..., processed_scans: _Optional[int] = ..., processes: _Optional[_Iterable[_Union[ProcessStatus, _Mapping]]] = ..., revision: _Optional[int] = ..., areas: _Optional[int] = ..., arcs: _Optional[int] = ..., keyframes: _Optional[int] = ..., hypotheses: _Optional[int] = ..., stored_keyframes: _Optional[int] = ..., localization: _Optional[_Union[Localization, _Mapping]] = ..., hypothesis: _Optional[int] = ...) -> None: ...
+    senders: _containers.RepeatedCompositeFieldContainer[SenderCounts]
+    def __init__(self, version: _Optional[str] = ..., config_hash: _Optional[str] = ..., state: _Optional[_Union[DaemonState, str]] = ..., uptime_s: _Optional[float] = ..., input: _Optional[_Union[InputCounts, _Mapping]] = ..., tracked_scans: _Optional[int] = ..., processed_scans: _Optional[int] = ..., processes: _Optional[_Iterable[_Union[ProcessStatus, _Mapping]]] = ..., revision: _Optional[int] = ..., areas: _Optional[int] = ..., arcs: _Optional[int] = ..., keyframes: _Optional[int] = ..., hypotheses: _Optional[int] = ..., stored_keyframes: _Optional[int] = ..., localization: _Optional[_Union[Localization, _Mapping]] = ..., hypothesis: _Optional[int] = ..., senders: _Optional[_Iterable[_Union[SenderCounts, _Mapping]]] = ...) -> None: ...
 
 class Ack(_message.Message):
     __slots__ = ("received", "accepted", "refused", "processed_scans", "files")
