@@ -78,6 +78,14 @@ def test_without_points_there_is_no_version() -> None:
     assert engine.area_details(0, with_points=False).area.version == 0
 
 
+def test_the_trajectory_is_that_of_all_keyframes_to_the_last_bit() -> None:
+    engine, _ = maps()
+    poses = engine._particles.best.keyframe_poses(engine._visits.values())
+    for pose, scan in zip(engine.trajectory(), engine._scans.scans(), strict=True):
+        expected = poses[scan.keyframe_index] @ scan.keyframe_from_body
+        np.testing.assert_array_equal(pose.reference_from_body, expected)
+
+
 def test_a_part_of_the_trajectory_is_that_of_the_whole() -> None:
     engine, _ = maps()
     whole = engine.trajectory()
