@@ -16,9 +16,9 @@ from dataclasses import dataclass
 from enum import StrEnum
 from functools import partial
 
+from hmt_service.client import HmtClient
 from hmt_service.core.types import HmtPose, Reading
 from hmt_service.errors import DeadlineExceeded, InvalidInput, Unavailable
-from hmt_service.service.client import HmtClient
 from hmt_service.service.codec import decode
 from hmt_service.service.keys import Keys, Topic
 from hmt_service.service.session import Endpoints, Mode, open_session

@@ -9,8 +9,8 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from hmt_service.client.local import local_daemon
 from hmt_service.errors import DaemonFailure
-from hmt_service.service.local import local_daemon
 
 
 @contextmanager

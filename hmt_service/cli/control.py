@@ -13,7 +13,7 @@ from hmt_service.cli.connection import Connect, Robot, Site
 from hmt_service.service.keys import DEFAULT_ENDPOINT
 
 if TYPE_CHECKING:
-    from hmt_service.service.client import HmtClient
+    from hmt_service.client import HmtClient
     from hmt_service.service.reports import Ack
 
 app = typer.Typer(no_args_is_help=True, help="Tell a daemon to finish, to save, to end.")
@@ -45,7 +45,7 @@ def shutdown(
 
 
 def _client(connect: str, site: str, robot: str) -> HmtClient:
-    from hmt_service.service.client import HmtClient
+    from hmt_service.client import HmtClient
 
     return HmtClient(connect, site=site, robot=robot)
 

@@ -32,8 +32,8 @@ def demo(
     """Simulate a building, send its scans to a daemon over Zenoh, and compare the global maps."""
     from rich.console import Console
 
-    from hmt_service.service.client import HmtClient
-    from hmt_service.service.local import local_daemon
+    from hmt_service.client import HmtClient
+    from hmt_service.client.local import local_daemon
     from hmt_service.service.results import TRAJECTORY
     from hmt_service.sim.simulation import INDOOR_LASER, simulate
     from hmt_service.sim.worlds.office import office

@@ -22,8 +22,8 @@ from hmt_service.service.keys import DEFAULT_ENDPOINT
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from hmt_service.client import HmtClient
     from hmt_service.core.types import Belief, GlobalMap, Localization
-    from hmt_service.service.client import HmtClient
     from hmt_service.service.reports import Status
 
 Run = Annotated[
@@ -256,7 +256,7 @@ def compare(
 
 
 def _client(connect: str, site: str, robot: str, timeout_s: float) -> HmtClient:
-    from hmt_service.service.client import HmtClient
+    from hmt_service.client import HmtClient
 
     return HmtClient(connect, site=site, robot=robot, timeout_s=timeout_s)
 
@@ -320,7 +320,10 @@ def _draw(
     from hmt_service.viz.figures import draw_maps
 
     methods = [method] if method is not None else list(MapMethod)
-    maps = [client.map(m, reference=reference, hypothesis=hypothesis) for m in methods]
+    maps: list[GlobalMap] = []
+    for each in methods:
+        known = maps[0] if maps else None  # both maps have the same submaps
+        maps.append(client.map(each, reference=reference, hypothesis=hypothesis, known=known))
     comparison = client.compare(reference=reference, hypothesis=hypothesis)
     draw_maps(maps, comparison, path)
 
@@ -332,6 +335,7 @@ def _status_rows(answer: Status) -> dict[str, str]:
         "received": f"{counts.received} samples",
         "accepted": f"{counts.accepted} readings, {counts.reordering} being ordered",
         "refused": _counted(counts.refused),
+        "lost": f"{sum(sender.lost for sender in answer.senders)} samples on their way",
         "waiting": f"{counts.queued} samples, {counts.queued_bytes / 1e6:.1f} MB",
         "dropped beams": _counted(counts.dropped_beams),
         "scans": f"{answer.tracked_scans} tracked, {answer.processed_scans} in the map",

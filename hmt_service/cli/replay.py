@@ -22,16 +22,13 @@ from hmt_service.service.keys import DEFAULT_ENDPOINT
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from hmt_service.client import HmtClient
     from hmt_service.core.types import Reading
-    from hmt_service.service.client import HmtClient
     from hmt_service.service.reports import Status
 
 _FARTHEST_M = 1e6
 """Everything finite is sent: what is a return is the daemon's settings' business."""
-_CHECK_EVERY_BYTES = 1_000_000
 _POLL_S = 0.1
-_MOST_QUEUED_BYTES = 64_000_000
-"""The sender waits while more than this waits at the daemon, which drops what it cannot hold."""
 
 
 def replay(
@@ -50,8 +47,8 @@ def replay(
     """Send a recorded log to a daemon, and wait for the map."""
     from rich.console import Console
 
+    from hmt_service.client import HmtClient
     from hmt_service.io.logs import read_log
-    from hmt_service.service.client import HmtClient
 
     console = Console(stderr=True)
     with HmtClient(connect, site=site, robot=robot) as client:
@@ -97,14 +94,11 @@ def replay_readings(
     from hmt_service.core.types import Scan
 
     before = client.status()
-    sent = scans = unchecked = 0
+    sent = scans = 0
     with Progress(console=console) as progress:
         sending = progress.add_task("sending", total=total)
         for reading in _paced(readings, rate):
-            if unchecked > _CHECK_EVERY_BYTES:
-                _wait_for_room(client)
-                unchecked = 0
-            unchecked += client.publish(reading)
+            client.publish(reading)
             sent += 1
             scans += isinstance(reading, Scan)
             progress.update(sending, completed=sent)
@@ -112,7 +106,7 @@ def replay_readings(
             mapping = progress.add_task("mapping", total=scans)
             known = before.processed_scans
             _finish(client, lambda n: progress.update(mapping, completed=n - known))
-    _report(console, sent, before, client.status())
+    _report(console, sent, sum(client.lost().values()), before, client.status())
 
 
 def _paced(readings: Iterable[Reading], rate: float | None) -> Iterator[Reading]:
@@ -129,11 +123,6 @@ def _paced(readings: Iterable[Reading], rate: float | None) -> Iterator[Reading]
         yield reading
 
 
-def _wait_for_room(client: HmtClient) -> None:
-    while client.status().input.queued_bytes > _MOST_QUEUED_BYTES:
-        time.sleep(_POLL_S)
-
-
 def _finish(client: HmtClient, show: Callable[[int], None]) -> None:
     """Have the map completed, and show the number of scans in it meanwhile."""
     with ThreadPoolExecutor(max_workers=1) as pool:
@@ -143,10 +132,9 @@ def _finish(client: HmtClient, show: Callable[[int], None]) -> None:
         show(ack.result().processed_scans)
 
 
-def _report(console: Console, sent: int, before: Status, after: Status) -> None:
-    received = after.input.received - before.input.received
-    if received < sent:
-        raise DaemonFailure(f"{sent - received} of {sent} readings did not reach the daemon")
+def _report(console: Console, sent: int, lost: int, before: Status, after: Status) -> None:
+    if lost:
+        raise DaemonFailure(f"{lost} of {sent} readings did not reach the daemon")
     new = Counter(after.input.refused) - Counter(before.input.refused)
     refused = ", ".join(f"{count} {reason}" for reason, count in new.items()) or "none"
     scans = after.processed_scans - before.processed_scans

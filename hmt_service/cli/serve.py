@@ -63,6 +63,12 @@ def serve(
             help="How long readings wait for earlier ones, s of sensor time; poses are that late.",
         ),
     ] = 0.25,
+    metrics: Annotated[
+        int | None,
+        typer.Option(
+            min=1, max=65535, help="Port on loopback that serves Prometheus metrics by HTTP."
+        ),
+    ] = None,
     out: Annotated[
         Path | None, typer.Option(help="Folder to save the results to when the map is finished.")
     ] = None,
@@ -119,6 +125,7 @@ def serve(
             keeper=kept,
             budget=budget,
             limits=IntakeLimits(reorder_s=reorder_window),
+            metrics_port=metrics,
         )
     )
     with _signals_to(daemon.request_stop):

@@ -39,7 +39,7 @@ from hmt_service.core.observation import ObservationModel
 from hmt_service.core.plausibility import Plausibility
 from hmt_service.core.refinement import Refinement
 from hmt_service.core.smoothing import Smoother
-from hmt_service.core.stored import ScanLog, StoredMap
+from hmt_service.core.stored import ScanLog, StoredMap, StoredScan
 from hmt_service.core.storing import (
     restored_hypothesis,
     restored_visits,
@@ -51,7 +51,9 @@ from hmt_service.core.transition import Places, Successor, Transition
 from hmt_service.core.types import (
     NO_POINTS,
     ArcResidual,
+    AreaDetails,
     AreaDifference,
+    AreaVisit,
     Comparison,
     Event,
     GlobalMap,
@@ -64,7 +66,9 @@ from hmt_service.core.types import (
     Snapshot,
     StampedPose,
     Tracking,
+    Trajectory,
 )
+from hmt_service.core.versions import NOTHING_KNOWN, recipe_of, version_of
 from hmt_service.core.visits import MemoryBudget, MemoryUsage, Visits, share_new
 from hmt_service.errors import InvalidInput, NotFound, Unavailable
 
@@ -110,6 +114,7 @@ class Engine:
         self._smoothed: tuple[int, FloatArray] | None = None
         self._first_of_session = 0
         self._frozen_visits = 0
+        self._versions: dict[int, tuple[bytes, int]] = {}
 
     @classmethod
     def restored(
@@ -547,6 +552,7 @@ class Engine:
         reference_area: int | None = None,
         hypothesis: int | None = None,
         with_points: bool = True,
+        known: Mapping[int, int] = NOTHING_KNOWN,
     ) -> GlobalMap:
         """Return all areas of one hypothesis in one frame (section IV-C).
 
@@ -555,6 +561,7 @@ class Engine:
             reference_area: Area whose frame is used; None for the first area.
             hypothesis: Identifier; None for the most probable one.
             with_points: Whether the submaps come with it.
+            known: Versions of submaps, by area, whose points are left out: who asks has them.
 
         Raises:
             Unavailable: Before the first keyframe.
@@ -568,15 +575,8 @@ class Engine:
         else:
             rng = np.random.default_rng([self._seed, self._revision])
             poses = compose_shortest_paths(arcs, reference, rng)
-        visits_to = chosen.topology.visits_to
         areas = tuple(
-            PlacedArea(
-                area=area,
-                reference_from_area=poses[area],
-                keyframes=sum(self._visits.keyframes(v) for v in visits_to[area]),
-                visits=len(visits_to[area]),
-                points_in_area=self._submap(chosen, area) if with_points else NO_POINTS,
-            )
+            self._placed(chosen, area, poses[area], with_points=with_points, known=known)
             for area in chosen.topology.areas
         )
         return GlobalMap(
@@ -587,6 +587,54 @@ class Engine:
             revision=self._revision,
             areas=areas,
             arcs=arcs,
+        )
+
+    def area_details(
+        self,
+        area: int,
+        *,
+        reference_area: int | None = None,
+        hypothesis: int | None = None,
+        with_points: bool = True,
+        known: Mapping[int, int] = NOTHING_KNOWN,
+    ) -> AreaDetails:
+        """Return everything that is known of one area, in the consistent map.
+
+        Args:
+            area: The area.
+            reference_area: Area whose frame its pose is in; None for the first area.
+            hypothesis: Identifier; None for the most probable one.
+            with_points: Whether its submap comes with it.
+            known: As in `global_map`.
+
+        Raises:
+            Unavailable: Before the first keyframe.
+            NotFound: If there is no such area or hypothesis.
+        """
+        chosen, probability = self._choose(hypothesis)
+        self._reference(chosen, area)
+        reference = self._reference(chosen, reference_area)
+        pose, area_from_reference = chosen.graph.relative(reference, area), self._into(chosen, area)
+        visits = chosen.topology.visits_to[area]
+        return AreaDetails(
+            reference_area=reference,
+            hypothesis=chosen.hypothesis,
+            probability=probability,
+            revision=self._revision,
+            area=self._placed(chosen, area, pose, with_points=with_points, known=known),
+            visits=tuple(
+                AreaVisit(
+                    visit=visit,
+                    area_from_visit=area_from_reference @ chosen.graph.pose(visit),
+                    last_stamp_s=self._visits.last_stamp_s(visit),
+                    keyframes=self._visits.keyframes(visit),
+                    is_forgotten=self._visits.is_forgotten(visit),
+                )
+                for visit in visits
+            ),
+            arcs=tuple(
+                arc for arc in arcs_of(chosen, self._motions) if area in (arc.area_a, arc.area_b)
+            ),
         )
 
     def compare(
@@ -636,14 +684,61 @@ class Engine:
         """
         if not self._visits:
             return ()
-        poses = self._smooth_poses()
-        if poses is None:
-            poses = self._particles.best.keyframe_poses(self._visits)
-        return tuple(
-            StampedPose(scan.stamp_s, poses[scan.keyframe_index] @ scan.keyframe_from_body)
-            for scan in self._scans.scans()
-            if scan.keyframe_index < len(poses)
+        return self._placed_scans(self._particles.best, self._scans.scans())
+
+    def trajectory_between(
+        self, start_s: float, end_s: float, *, hypothesis: int | None = None
+    ) -> Trajectory:
+        """Return the globally consistent poses of the scans of an interval.
+
+        Args:
+            start_s: Its begin, sensor time, included.
+            end_s: Its end, included.
+            hypothesis: Identifier; None for the most probable one.
+
+        Raises:
+            Unavailable: Before the first keyframe.
+            NotFound: If there is no such hypothesis.
+        """
+        chosen, probability = self._choose(hypothesis)
+        return Trajectory(
+            reference_area=self._reference(chosen, None),
+            hypothesis=chosen.hypothesis,
+            probability=probability,
+            revision=self._revision,
+            is_smoothed=self._is_smoothed(chosen),
+            poses=self._placed_scans(chosen, self._scans.between(start_s, end_s)),
         )
+
+    def _is_smoothed(self, hypothesis: Hypothesis) -> bool:
+        return hypothesis is self._particles.best and self._smooth_poses() is not None
+
+    def _placed_scans(
+        self, hypothesis: Hypothesis, scans: Sequence[StoredScan]
+    ) -> tuple[StampedPose, ...]:
+        """Return where scans were taken, but for those whose keyframe is not in the map."""
+        known = [scan for scan in scans if scan.keyframe_index < self.keyframes]
+        if not known:
+            return ()
+        keyframes = [scan.keyframe_index for scan in known]
+        first, poses = self._keyframe_poses(hypothesis, min(keyframes), max(keyframes))
+        return tuple(
+            StampedPose(scan.stamp_s, poses[scan.keyframe_index - first] @ scan.keyframe_from_body)
+            for scan in known
+        )
+
+    def _keyframe_poses(
+        self, hypothesis: Hypothesis, first: int, last: int
+    ) -> tuple[int, FloatArray]:
+        """Return the poses of at least these keyframes, and which is the first of them."""
+        smoothed = self._smooth_poses()
+        if smoothed is not None and self._is_smoothed(hypothesis):
+            return 0, smoothed
+        # Only visits that are asked for: others may have to be read from the disk.
+        starts = np.cumsum([0, *map(self._visits.keyframes, self._visits)])
+        begin, end = np.searchsorted(starts, [first, last], side="right")
+        visits = map(self._visits.__getitem__, range(begin - 1, end))
+        return int(starts[begin - 1]), hypothesis.keyframe_poses(visits)
 
     def stored(self) -> StoredMap:
         """Return everything that a map file needs to hold."""
@@ -678,15 +773,59 @@ class Engine:
             )
         return reference
 
-    def _submap(self, hypothesis: Hypothesis, area: int) -> Points:
-        """Return the points of all visits to an area, in its frame."""
-        area_from_reference = inverse(hypothesis.graph.pose(area))
-        clouds = [
-            self._visits[visit].points_in(area_from_reference @ hypothesis.graph.pose(visit))
+    def _placed(
+        self,
+        hypothesis: Hypothesis,
+        area: int,
+        reference_from_area: GaussianPose,
+        *,
+        with_points: bool,
+        known: Mapping[int, int],
+    ) -> PlacedArea:
+        visits = hypothesis.topology.visits_to[area]
+        points, version = NO_POINTS, 0
+        if with_points:
+            points, version = self._submap(hypothesis, area, known.get(area))
+        return PlacedArea(
+            area=area,
+            reference_from_area=reference_from_area,
+            keyframes=sum(self._visits.keyframes(visit) for visit in visits),
+            visits=len(visits),
+            points_in_area=points,
+            version=version,
+        )
+
+    def _submap(self, hypothesis: Hypothesis, area: int, known: int | None) -> tuple[Points, int]:
+        """Return the points of all visits to an area, in its frame, and their version.
+
+        No points if `known` is that version; then they are not even put together, unless something
+        that they are made of has changed since.
+        """
+        area_from_reference = self._into(hypothesis, area)
+        made_of = [
+            (visit, area_from_reference @ hypothesis.graph.pose(visit))
             for visit in hypothesis.topology.visits_to[area]
             if not self._visits.is_forgotten(visit)
         ]
-        return as_points(np.concatenate(clouds))
+        parts = (
+            b"%d %d " % (visit, self._visits.keyframes(visit)) + pose.tobytes()
+            for visit, pose in made_of
+        )
+        recipe = recipe_of(parts)
+        before, version = self._versions.get(area, (b"", 0))
+        if recipe == before and version == known:
+            return NO_POINTS, version
+        points = as_points(
+            np.concatenate([self._visits[visit].points_in(pose) for visit, pose in made_of])
+        )
+        version = version_of(points)
+        self._versions[area] = recipe, version
+        return (NO_POINTS if version == known else points), version
+
+    @staticmethod
+    def _into(hypothesis: Hypothesis, area: int) -> Pose:
+        """Return `area_from_reference`, the inverse of the area's pose in its graph."""
+        return inverse(hypothesis.graph.pose(area))
 
 
 _ANY_CUT = 2.0

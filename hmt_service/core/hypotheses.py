@@ -12,7 +12,7 @@ References:
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -138,13 +138,13 @@ class Hypothesis:
             return certain(identity())
         return self.graph.relative(area, visit)
 
-    def keyframe_poses(self, visits: Mapping[int, Visit]) -> FloatArray:
-        """Return the pose of every keyframe in the frame of the first visit, shape (K, 4, 4)."""
+    def keyframe_poses(self, visits: Iterable[Visit]) -> FloatArray:
+        """Return the poses of all keyframes of visits in the first area's frame, (K, 4, 4)."""
         placed = self.graph.poses()
         return np.concatenate(
             [
                 placed[visit.visit] @ np.array([pose.mean for pose in visit.visit_from_keyframe])
-                for visit in visits.values()
+                for visit in visits
             ]
         )
 
@@ -429,6 +429,7 @@ class ParticleLayer:
                 topological_path=h.topology.path,
                 areas=len(h.topology.areas),
                 loop_closures=len(h.topology.assignments) - len(h.topology.areas),
+                arcs=h.topology.arcs,
             )
             for h, probability in zip(self._hypotheses, self.probabilities, strict=True)
         )

@@ -80,7 +80,7 @@ class Smoother:
             hypothesis: Says which keyframes are near each other.
             visits: All visits.
         """
-        poses = hypothesis.keyframe_poses(visits)
+        poses = hypothesis.keyframe_poses(visits.values())
         smoothed = self._smoothed(hypothesis, visits, poses)
         first_of = np.cumsum([0, *map(visits.keyframes, visits)])
         for visit in filter(visits.is_forgotten, visits):

@@ -119,6 +119,14 @@ class ScanLog:
         full, rest = divmod(len(self._stamps_s), _TOGETHER)
         return Chunked([_TOGETHER] * full + [rest], self._chunk)
 
+    def between(self, start_s: float, end_s: float) -> list[StoredScan]:
+        """Return the scans of an interval of sensor time, both ends included."""
+        stamps_s = np.array(self._stamps_s)
+        inside = np.flatnonzero((stamps_s >= start_s) & (stamps_s <= end_s))
+        tangents = np.array(self._tangents, dtype=np.float64).reshape(-1, 6)[inside]
+        keyframes = [self._keyframes[scan] for scan in inside]
+        return list(map(StoredScan, stamps_s[inside].tolist(), keyframes, exp(tangents)))
+
     def _chunk(self, chunk: int) -> list[StoredScan]:
         part = slice(chunk * _TOGETHER, (chunk + 1) * _TOGETHER)
         tangents = self._tangents[6 * part.start : 6 * part.stop]

@@ -167,6 +167,20 @@ class HypothesisSummary:
     """Number of areas."""
     loop_closures: int
     """Number of times that a known area was entered again."""
+    arcs: int
+    """Number of pairs of areas that the robot has gone between directly."""
+
+
+@dataclass(frozen=True, slots=True)
+class Hypotheses:
+    """All topologies that the robot may have travelled."""
+
+    stamp_s: float
+    """Sensor time of the last keyframe in them."""
+    revision: int
+    """Map revision."""
+    hypotheses: tuple[HypothesisSummary, ...]
+    """The most probable first; probabilities sum to one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -217,6 +231,8 @@ class Belief:
 class History:
     """What was believed over time: where that changed, just before and just after."""
 
+    revision: int
+    """Map revision of the last of them; zero before the first keyframe."""
     beliefs: tuple[Belief, ...]
     """In time order."""
 
@@ -265,7 +281,11 @@ class PlacedArea:
     visits: int
     """How many times the robot has been there."""
     points_in_area: Points
-    """Submap: the points of all visits, shape (N, 3), m."""
+    """Submap: the points of all visits, shape (N, 3), m; none if nobody asked for them, or who did
+    has them in this version."""
+    version: int = 0
+    """Of the submap, below 2^48: changes exactly when its points do, and is the same again when
+    they are; 0 when nobody asked for them."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -300,6 +320,42 @@ class GlobalMap:
     """In the order of their identifiers."""
     arcs: tuple[Arc, ...]
     """In the order of their identifiers."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AreaVisit:
+    """One stay of the robot in an area."""
+
+    visit: int
+    """Identifier, in order of time."""
+    area_from_visit: Pose
+    """Pose of its frame, that of its first keyframe, in the area's, shape (4, 4)."""
+    last_stamp_s: float
+    """Sensor time of its last keyframe."""
+    keyframes: int
+    """Number of its keyframes."""
+    is_forgotten: bool
+    """Whether of what it has seen nothing is kept, because it was known."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AreaDetails:
+    """One area of one hypothesis, with everything that is known of it."""
+
+    reference_area: int
+    """Area whose frame its pose is in."""
+    hypothesis: int
+    """Hypothesis that it is an area of."""
+    probability: float
+    """Its posterior mass."""
+    revision: int
+    """Map revision."""
+    area: PlacedArea
+    """The area, in the consistent map."""
+    visits: tuple[AreaVisit, ...]
+    """In time order; the first one founded the area, and has its frame."""
+    arcs: tuple[Arc, ...]
+    """To its neighbours, in the order of their identifiers."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -356,6 +412,24 @@ class StampedPose:
     """Sensor time of the scan."""
     reference_from_body: Pose
     """Globally consistent pose of the robot's centre, shape (4, 4)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trajectory:
+    """Where the robot was, says one hypothesis."""
+
+    reference_area: int
+    """Area whose frame the poses are in."""
+    hypothesis: int
+    """Hypothesis that says so."""
+    probability: float
+    """Its posterior mass."""
+    revision: int
+    """Map revision."""
+    is_smoothed: bool
+    """Whether all poses were estimated together; else each keyframe is where its visit is."""
+    poses: tuple[StampedPose, ...]
+    """One per scan, in the order that they came."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from multiprocessing.connection import Connection
 from typing import Any
 
-from hmt_service.runtime.messages import Ready, Stop, dump, load
+from hmt_service.runtime.messages import Part, Ready, Stop, dump, load
 from hmt_service.runtime.queues import SizedQueue
 
 _IN_FLIGHT = 2
@@ -120,6 +120,8 @@ class Link:
                         self._receive(message.known, data)
                     continue
                 self._receive(message, data)
+                if isinstance(message, Part) and not message.is_last:
+                    continue
                 self._answered += 1
                 self._credit.release()
         except (EOFError, ConnectionResetError):

@@ -1,8 +1,8 @@
 """What the processes of the daemon say to each other: frozen values, pickled over pipes.
 
 Every message that the parent sends is answered by exactly one message of the child on the same
-pipe, in order. That makes the number of messages under way known, and a bound on it a bound on
-memory.
+pipe, in order; answers to requests may come in several parts. That makes the number of messages
+under way known, and a bound on it a bound on memory.
 
 References:
     own.
@@ -11,8 +11,8 @@ References:
 from __future__ import annotations
 
 import pickle
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
 from enum import StrEnum
 from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
@@ -21,12 +21,14 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from hmt_service.core.config import Config
 from hmt_service.core.types import (
+    AreaDetails,
     Comparison,
     Event,
     GlobalMap,
     MapMethod,
     Snapshot,
     Tracking,
+    Trajectory,
 )
 from hmt_service.errors import HmtError
 
@@ -135,6 +137,36 @@ class MapRequest:
     """Hypothesis; None for the most probable one."""
     with_points: bool = True
     """Whether to include the submaps."""
+    known: Mapping[int, int] = field(default_factory=dict)
+    """Versions of submaps, by area, whose points are left out: who asks has them."""
+
+
+@dataclass(frozen=True, slots=True)
+class AreaRequest:
+    """Tell everything of one area."""
+
+    area: int
+    """Which one."""
+    reference_area: int | None = None
+    """Area whose frame its pose shall be in; None for the engine's choice."""
+    hypothesis: int | None = None
+    """Hypothesis; None for the most probable one."""
+    with_points: bool = True
+    """Whether to include the submap."""
+    known: Mapping[int, int] = field(default_factory=dict)
+    """As in `MapRequest`."""
+
+
+@dataclass(frozen=True, slots=True)
+class TrajectoryRequest:
+    """Tell where the scans of an interval were taken."""
+
+    start_s: float
+    """Its begin, sensor time, included."""
+    end_s: float
+    """Its end, included."""
+    hypothesis: int | None = None
+    """Hypothesis; None for the most probable one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,10 +218,71 @@ class ProcessFailure:
         return f"process {self.name} (pid {self.pid}) {self.reason}"
 
 
-Request = MapRequest | CompareRequest | SaveRequest
+Request = MapRequest | AreaRequest | CompareRequest | TrajectoryRequest | SaveRequest
 """What the topology process can be asked."""
-Result = GlobalMap | Comparison | tuple[str, ...] | HmtError
-"""Its answers: a map, a comparison, the names of saved files, or why not."""
+Answer = GlobalMap | AreaDetails | Comparison | Trajectory
+"""What it can tell."""
+
+
+@dataclass(frozen=True, slots=True)
+class Wire:
+    """One payload as it travels."""
+
+    payload: bytes
+    """A serialised message."""
+    encoding: str
+    """Which one it is."""
+
+
+Encode = Callable[[Answer], Wire]
+"""Serialises answers, in the topology process, which alone may work for long; picklable."""
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """A request on its way to the topology process."""
+
+    request: Request
+    """What is asked."""
+    deadline_s: float
+    """Time of the monotonic clock, which all processes share, when nobody waits any more."""
+    part_bytes: int | None
+    """Largest part that the answer may be cut into; None if it must be whole."""
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """A piece of a serialised answer: joined in order, the payloads of all parts are it."""
+
+    number: int
+    """Its place, from 0."""
+    count: int
+    """How many there are."""
+    wire: Wire
+    """Its bytes, with the encoding of the whole."""
+
+    @property
+    def is_last(self) -> bool:
+        """Whether the answer is complete with it."""
+        return self.number == self.count - 1
+
+
+def parts_of(whole: Wire, part_bytes: int) -> Iterator[Part]:
+    """Yield the parts of an answer, at least one.
+
+    Args:
+        whole: The answer.
+        part_bytes: Largest size of one, > 0.
+    """
+    size = len(whole.payload)
+    count = max(1, -(-size // part_bytes))
+    for number in range(count):
+        piece = whole.payload[number * part_bytes : (number + 1) * part_bytes]
+        yield Part(number, count, Wire(piece, whole.encoding))
+
+
+Result = Part | tuple[str, ...] | HmtError
+"""What comes back: an answer part by part, the names of saved files, or why not."""
 
 
 class Keeper(Protocol):

@@ -29,9 +29,12 @@ from hmt_service.core.types import Reading, Tracking
 from hmt_service.errors import DeadlineExceeded, Unavailable
 from hmt_service.runtime.links import Link
 from hmt_service.runtime.messages import (
+    Asked,
+    Encode,
     Finish,
     Keeper,
     Mapped,
+    Part,
     ProcessFailure,
     ProcessName,
     ProcessStatus,
@@ -70,7 +73,7 @@ class Listener(Protocol):
 @dataclass(slots=True)
 class _Pending:
     on_result: Callable[[Result], None] | None
-    """None once it was called."""
+    """None once it was called with the answer, the last part of it, or an error."""
     deadline_s: float
 
 
@@ -81,6 +84,7 @@ class Pipeline:
         self,
         config: Config,
         *,
+        encode: Encode,
         seed: int = 0,
         save: Save | None = None,
         keeper: Keeper | None = None,
@@ -90,6 +94,7 @@ class Pipeline:
 
         Args:
             config: Settings of the mapping core.
+            encode: Serialises answers, in the topology process.
             seed: Seed of the engine's random generator.
             save: Writes the results, in the topology process, when the map is finished or saved;
                 None for never.
@@ -102,6 +107,7 @@ class Pipeline:
         self._save = save
         self._keeper = keeper
         self._budget = budget
+        self._encode = encode
         self._progress = Tracked(None, 0, 0.0)
         self._tracked_scans = 0
         self._report = RunReport(0, 0.0, 0.0)
@@ -129,6 +135,7 @@ class Pipeline:
                     self._save,
                     self._keeper,
                     self._budget,
+                    self._encode,
                 ),
                 name="hmt-topology",
             ),
@@ -197,19 +204,28 @@ class Pipeline:
         return self._topology.put_token(finish)
 
     def request(
-        self, request: Request, on_result: Callable[[Result], None], *, timeout_s: float
+        self,
+        request: Request,
+        on_result: Callable[[Result], None],
+        *,
+        timeout_s: float,
+        part_bytes: int | None = None,
     ) -> None:
         """Ask the topology.
 
         Args:
             request: The question.
-            on_result: Called once, from any thread, with the answer or with why there is none.
+            on_result: Called, from any thread, with every part of the answer in order, or once with
+                why there is none; an error may also follow some parts. While it blocks, nobody
+                else is answered.
             timeout_s: Time of the wall clock after which there is none.
+            part_bytes: Largest part that the answer may be cut into; None if it must be whole.
         """
         pending = _Pending(on_result, time.monotonic() + timeout_s)
         with self._pending_lock:
             waiting = len(self._pending)
-            is_taken = waiting < _MAX_REQUESTS and self._requests.put_token(request)
+            asked = Asked(request, pending.deadline_s, part_bytes)
+            is_taken = waiting < _MAX_REQUESTS and self._requests.put_token(asked)
             if is_taken:
                 self._pending.append(pending)
         if not is_taken:
@@ -276,12 +292,15 @@ class Pipeline:
 
     def _on_result(self, message: Result, _: bytes) -> None:
         with self._pending_lock:
-            pending = self._pending.popleft()
+            is_over = not isinstance(message, Part) or message.is_last
+            pending = self._pending.popleft() if is_over else self._pending[0]
         self._answer(pending, message)
 
     def _answer(self, pending: _Pending, result: Result) -> None:
         with self._pending_lock:
-            on_result, pending.on_result = pending.on_result, None
+            on_result = pending.on_result
+            if not isinstance(result, Part) or result.is_last:
+                pending.on_result = None
         if on_result is not None:
             on_result(result)
 

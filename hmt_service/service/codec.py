@@ -7,18 +7,19 @@ References:
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, TypeVar
 
 import numpy as np
 from google.protobuf.message import DecodeError, Message
 
-from hmt_service.core.geometry import GaussianPose, pose_of, quaternion_of
+from hmt_service.core.geometry import GaussianPose, Pose, pose_of, quaternion_of
 from hmt_service.core.types import (
     Arc,
     ArcResidual,
+    AreaDetails,
     AreaDifference,
+    AreaVisit,
     Belief,
     Comparison,
     Event,
@@ -26,11 +27,14 @@ from hmt_service.core.types import (
     GlobalMap,
     History,
     HmtPose,
+    Hypotheses,
     HypothesisSummary,
     Localization,
     MapMethod,
     PlacedArea,
     Posterior,
+    StampedPose,
+    Trajectory,
 )
 from hmt_service.errors import (
     DaemonFailure,
@@ -40,8 +44,9 @@ from hmt_service.errors import (
     NotFound,
     Unavailable,
 )
-from hmt_service.runtime.messages import ProcessName, ProcessStatus
-from hmt_service.service.reports import Ack, DaemonState, InputCounts, Status
+from hmt_service.runtime.messages import Part, ProcessName, ProcessStatus, Wire
+from hmt_service.service.keys import Input
+from hmt_service.service.reports import Ack, DaemonState, InputCounts, SenderCounts, Status
 from hmt_service.service.v1 import hmt_pb2 as pb
 
 PREFIX = "application/protobuf;"
@@ -52,16 +57,6 @@ _FAILURES: dict[str, type[HmtError]] = {
 }
 
 E_ = TypeVar("E_", bound=StrEnum)
-
-
-@dataclass(frozen=True, slots=True)
-class Wire:
-    """One payload as it travels."""
-
-    payload: bytes
-    """A serialised protobuf."""
-    encoding: str
-    """`application/protobuf;` and the full name of its message."""
 
 
 def wire(message: Message) -> Wire:
@@ -77,8 +72,11 @@ def encoding_of(message: type[Message]) -> str:
 Value = (
     HmtPose
     | Posterior
+    | Hypotheses
     | History
     | GlobalMap
+    | AreaDetails
+    | Trajectory
     | Comparison
     | Event
     | tuple[Event, ...]
@@ -108,10 +106,60 @@ def decode(payload: bytes, encoding: str) -> Value | HmtError:
         raise InvalidInput(f"{len(payload)} bytes are no {encoding}: {error}") from error
 
 
+def encode_origin(sender: int, number: int) -> bytes:
+    """Return what a sender attaches to a reading.
+
+    Args:
+        sender: Number that it has drawn for itself, in [1, 2^64).
+        number: Place of the reading among those that it sends under one key, from 0.
+    """
+    return pb.Origin(sender=sender, number=number).SerializeToString()
+
+
+def decode_origin(attachment: bytes) -> tuple[int, int] | None:
+    """Return sender and number of a reading; None if the attachment does not say them."""
+    try:
+        origin = pb.Origin.FromString(attachment)
+    except DecodeError:
+        return None
+    return (origin.sender, origin.number) if origin.sender else None
+
+
+def encode_place(part: Part) -> bytes:
+    """Return what is attached to a reply that is only a part of an answer."""
+    return pb.Part(number=part.number, count=part.count).SerializeToString()
+
+
+def decode_place(attachment: bytes) -> tuple[int, int]:
+    """Return the place of a part, from 0, and the number of parts.
+
+    Raises:
+        InvalidInput: If the attachment says neither.
+    """
+    try:
+        part = pb.Part.FromString(attachment)
+    except DecodeError as error:
+        raise InvalidInput(f"{len(attachment)} bytes are no hmt.v1.Part: {error}") from error
+    if part.number >= part.count:
+        raise InvalidInput(f"part {part.number} of {part.count}")
+    return part.number, part.count
+
+
 def _message_of(value: Value | HmtError) -> Message:
     if isinstance(value, HmtError):
         return pb.Error(code=f"ERROR_CODE_{value.code}", message=str(value))
     return _ENCODERS[type(value)](value)
+
+
+def _transform_to_proto(pose: Pose) -> pb.Pose:
+    x, y, z = pose[:3, 3].tolist()
+    qx, qy, qz, qw = quaternion_of(pose).tolist()
+    return pb.Pose(x_m=x, y_m=y, z_m=z, qx=qx, qy=qy, qz=qz, qw=qw)
+
+
+def _transform(message: pb.Pose | pb.GaussianPose) -> Pose:
+    quaternion = np.array([message.qx, message.qy, message.qz, message.qw])
+    return pose_of(quaternion, np.array([message.x_m, message.y_m, message.z_m]))
 
 
 def _gaussian_to_proto(pose: GaussianPose) -> pb.GaussianPose:
@@ -122,9 +170,8 @@ def _gaussian_to_proto(pose: GaussianPose) -> pb.GaussianPose:
 
 
 def _gaussian(message: pb.GaussianPose) -> GaussianPose:
-    quaternion = np.array([message.qx, message.qy, message.qz, message.qw])
-    mean = pose_of(quaternion, np.array([message.x_m, message.y_m, message.z_m]))
-    return GaussianPose(mean, np.array(message.covariance, dtype=np.float64).reshape(6, 6))
+    covariance = np.array(message.covariance, dtype=np.float64).reshape(6, 6)
+    return GaussianPose(_transform(message), covariance)
 
 
 def _pose_to_proto(pose: HmtPose) -> pb.HmtPose:
@@ -174,21 +221,48 @@ def _localization(message: pb.Localization) -> Localization:
     )
 
 
+def _summary_to_proto(summary: HypothesisSummary) -> pb.HypothesisSummary:
+    return pb.HypothesisSummary(
+        hypothesis=summary.hypothesis,
+        probability=summary.probability,
+        current_area=summary.current_area,
+        topological_path=summary.topological_path,
+        areas=summary.areas,
+        loop_closures=summary.loop_closures,
+        arcs=summary.arcs,
+    )
+
+
+def _summary(message: pb.HypothesisSummary) -> HypothesisSummary:
+    return HypothesisSummary(
+        hypothesis=message.hypothesis,
+        probability=message.probability,
+        current_area=message.current_area,
+        topological_path=tuple(message.topological_path),
+        areas=message.areas,
+        loop_closures=message.loop_closures,
+        arcs=message.arcs,
+    )
+
+
+def _hypotheses_to_proto(hypotheses: Hypotheses) -> pb.Hypotheses:
+    return pb.Hypotheses(
+        stamp_s=hypotheses.stamp_s,
+        revision=hypotheses.revision,
+        hypotheses=map(_summary_to_proto, hypotheses.hypotheses),
+    )
+
+
+def _hypotheses(message: pb.Hypotheses) -> Hypotheses:
+    known = tuple(map(_summary, message.hypotheses))
+    return Hypotheses(message.stamp_s, message.revision, known)
+
+
 def _posterior_to_proto(posterior: Posterior) -> pb.Posterior:
     return pb.Posterior(
         stamp_s=posterior.stamp_s,
         revision=posterior.revision,
-        hypotheses=[
-            pb.HypothesisSummary(
-                hypothesis=summary.hypothesis,
-                probability=summary.probability,
-                current_area=summary.current_area,
-                topological_path=summary.topological_path,
-                areas=summary.areas,
-                loop_closures=summary.loop_closures,
-            )
-            for summary in posterior.hypotheses
-        ],
+        hypotheses=map(_summary_to_proto, posterior.hypotheses),
         current_area=dict(posterior.current_area),
         effective_sample_size=posterior.effective_sample_size,
     )
@@ -214,17 +288,7 @@ def _posterior(message: pb.Posterior) -> Posterior:
     return Posterior(
         stamp_s=message.stamp_s,
         revision=message.revision,
-        hypotheses=tuple(
-            HypothesisSummary(
-                hypothesis=summary.hypothesis,
-                probability=summary.probability,
-                current_area=summary.current_area,
-                topological_path=tuple(summary.topological_path),
-                areas=summary.areas,
-                loop_closures=summary.loop_closures,
-            )
-            for summary in message.hypotheses
-        ),
+        hypotheses=tuple(map(_summary, message.hypotheses)),
         current_area=dict(message.current_area),
         effective_sample_size=message.effective_sample_size,
     )
@@ -237,25 +301,8 @@ def _map_to_proto(global_map: GlobalMap) -> pb.GlobalMap:
         hypothesis=global_map.hypothesis,
         probability=global_map.probability,
         revision=global_map.revision,
-        areas=[
-            pb.PlacedArea(
-                area=area.area,
-                reference_from_area=_gaussian_to_proto(area.reference_from_area),
-                keyframes=area.keyframes,
-                visits=area.visits,
-                points_in_area=np.asarray(area.points_in_area, dtype="<f4").tobytes(),
-            )
-            for area in global_map.areas
-        ],
-        arcs=[
-            pb.Arc(
-                area_a=arc.area_a,
-                area_b=arc.area_b,
-                a_from_b=_gaussian_to_proto(arc.a_from_b),
-                traversals=arc.traversals,
-            )
-            for arc in global_map.arcs
-        ],
+        areas=map(_area_to_proto, global_map.areas),
+        arcs=map(_arc_to_proto, global_map.arcs),
     )
 
 
@@ -266,19 +313,112 @@ def _map(message: pb.GlobalMap) -> GlobalMap:
         hypothesis=message.hypothesis,
         probability=message.probability,
         revision=message.revision,
-        areas=tuple(
-            PlacedArea(
-                area=area.area,
-                reference_from_area=_gaussian(area.reference_from_area),
-                keyframes=area.keyframes,
-                visits=area.visits,
-                points_in_area=np.frombuffer(area.points_in_area, dtype="<f4").reshape(-1, 3),
+        areas=tuple(map(_area, message.areas)),
+        arcs=tuple(map(_arc, message.arcs)),
+    )
+
+
+def _area_to_proto(area: PlacedArea) -> pb.PlacedArea:
+    return pb.PlacedArea(
+        area=area.area,
+        reference_from_area=_gaussian_to_proto(area.reference_from_area),
+        keyframes=area.keyframes,
+        visits=area.visits,
+        points_in_area=np.asarray(area.points_in_area, dtype="<f4").tobytes(),
+        version=area.version,
+    )
+
+
+def _area(message: pb.PlacedArea) -> PlacedArea:
+    return PlacedArea(
+        area=message.area,
+        reference_from_area=_gaussian(message.reference_from_area),
+        keyframes=message.keyframes,
+        visits=message.visits,
+        points_in_area=np.frombuffer(message.points_in_area, dtype="<f4").reshape(-1, 3),
+        version=message.version,
+    )
+
+
+def _arc_to_proto(arc: Arc) -> pb.Arc:
+    return pb.Arc(
+        area_a=arc.area_a,
+        area_b=arc.area_b,
+        a_from_b=_gaussian_to_proto(arc.a_from_b),
+        traversals=arc.traversals,
+    )
+
+
+def _arc(message: pb.Arc) -> Arc:
+    return Arc(message.area_a, message.area_b, _gaussian(message.a_from_b), message.traversals)
+
+
+def _area_details_to_proto(details: AreaDetails) -> pb.AreaDetails:
+    return pb.AreaDetails(
+        reference_area=details.reference_area,
+        hypothesis=details.hypothesis,
+        probability=details.probability,
+        revision=details.revision,
+        area=_area_to_proto(details.area),
+        visits=[
+            pb.AreaVisit(
+                visit=visit.visit,
+                area_from_visit=_transform_to_proto(visit.area_from_visit),
+                last_stamp_s=visit.last_stamp_s,
+                keyframes=visit.keyframes,
+                is_forgotten=visit.is_forgotten,
             )
-            for area in message.areas
+            for visit in details.visits
+        ],
+        arcs=map(_arc_to_proto, details.arcs),
+    )
+
+
+def _area_details(message: pb.AreaDetails) -> AreaDetails:
+    return AreaDetails(
+        reference_area=message.reference_area,
+        hypothesis=message.hypothesis,
+        probability=message.probability,
+        revision=message.revision,
+        area=_area(message.area),
+        visits=tuple(
+            AreaVisit(
+                visit=visit.visit,
+                area_from_visit=_transform(visit.area_from_visit),
+                last_stamp_s=visit.last_stamp_s,
+                keyframes=visit.keyframes,
+                is_forgotten=visit.is_forgotten,
+            )
+            for visit in message.visits
         ),
-        arcs=tuple(
-            Arc(arc.area_a, arc.area_b, _gaussian(arc.a_from_b), arc.traversals)
-            for arc in message.arcs
+        arcs=tuple(map(_arc, message.arcs)),
+    )
+
+
+def _trajectory_to_proto(trajectory: Trajectory) -> pb.Trajectory:
+    poses = np.array([pose.reference_from_body for pose in trajectory.poses]).reshape(-1, 4, 4)
+    return pb.Trajectory(
+        reference_area=trajectory.reference_area,
+        hypothesis=trajectory.hypothesis,
+        probability=trajectory.probability,
+        revision=trajectory.revision,
+        is_smoothed=trajectory.is_smoothed,
+        stamps_s=[pose.stamp_s for pose in trajectory.poses],
+        reference_from_body=np.hstack([poses[:, :3, 3], quaternion_of(poses)]).ravel().tolist(),
+    )
+
+
+def _trajectory(message: pb.Trajectory) -> Trajectory:
+    poses = np.array(message.reference_from_body, dtype=np.float64).reshape(-1, 7)
+    return Trajectory(
+        reference_area=message.reference_area,
+        hypothesis=message.hypothesis,
+        probability=message.probability,
+        revision=message.revision,
+        is_smoothed=message.is_smoothed,
+        poses=tuple(
+            StampedPose(stamp_s, pose_of(pose[3:], pose[:3]))
+            for stamp_s, pose in zip(message.stamps_s, poses, strict=True)
         ),
     )
 
@@ -390,10 +530,20 @@ def _status_to_proto(status: Status) -> pb.Status:
         arcs=status.arcs,
         keyframes=status.keyframes,
         hypotheses=status.hypotheses,
+        hypothesis=status.hypothesis,
         stored_keyframes=status.stored_keyframes,
         localization=(
             None if status.localization is None else _localization_to_proto(status.localization)
         ),
+        senders=[
+            pb.SenderCounts(
+                sender=counts.sender,
+                input=counts.input,
+                received=counts.received,
+                lost=counts.lost,
+            )
+            for counts in status.senders
+        ],
     )
 
 
@@ -432,9 +582,14 @@ def _status(message: pb.Status) -> Status:
         arcs=message.arcs,
         keyframes=message.keyframes,
         hypotheses=message.hypotheses,
+        hypothesis=message.hypothesis if message.HasField("hypothesis") else None,
         stored_keyframes=message.stored_keyframes,
         localization=(
             _localization(message.localization) if message.HasField("localization") else None
+        ),
+        senders=tuple(
+            SenderCounts(counts.sender, Input(counts.input), counts.received, counts.lost)
+            for counts in message.senders
         ),
     )
 
@@ -464,8 +619,13 @@ def _enum(enum: type[E_], name: str, prefix: str) -> E_:
 _ENCODERS: dict[type, Callable[[Any], Message]] = {
     HmtPose: _pose_to_proto,
     Posterior: _posterior_to_proto,
-    History: lambda history: pb.History(beliefs=map(_belief_to_proto, history.beliefs)),
+    Hypotheses: _hypotheses_to_proto,
+    History: lambda history: pb.History(
+        revision=history.revision, beliefs=map(_belief_to_proto, history.beliefs)
+    ),
     GlobalMap: _map_to_proto,
+    AreaDetails: _area_details_to_proto,
+    Trajectory: _trajectory_to_proto,
     Comparison: _comparison_to_proto,
     Event: _event_to_proto,
     tuple: lambda events: pb.Events(events=map(_event_to_proto, events)),
@@ -483,11 +643,17 @@ _DECODERS: dict[str, tuple[type[Message], Callable[[Any], Value | HmtError]]] = 
     for message, from_proto in (
         (pb.HmtPose, _pose),
         (pb.Posterior, _posterior),
+        (pb.Hypotheses, _hypotheses),
         (pb.GlobalMap, _map),
+        (pb.AreaDetails, _area_details),
+        (pb.Trajectory, _trajectory),
         (pb.Comparison, _comparison),
         (pb.Event, _event),
         (pb.Events, lambda message: tuple(map(_event, message.events))),
-        (pb.History, lambda message: History(tuple(map(_belief, message.beliefs)))),
+        (
+            pb.History,
+            lambda message: History(message.revision, tuple(map(_belief, message.beliefs))),
+        ),
         (pb.Status, _status),
         (pb.Ack, _ack),
         (pb.Error, _error),

@@ -19,9 +19,11 @@ from hmt_service.core.types import Event, EventKind
 from hmt_service.errors import DaemonFailure
 from hmt_service.runtime.messages import Finished, Keeper, ProcessFailure, ProcessName, Save
 from hmt_service.runtime.pipeline import Pipeline
+from hmt_service.service.codec import encode
 from hmt_service.service.gateway import Gateway
 from hmt_service.service.intake import IntakeLimits
 from hmt_service.service.keys import Keys
+from hmt_service.service.metrics import metrics_server
 from hmt_service.service.reports import Status
 from hmt_service.service.session import Endpoints, open_session
 
@@ -58,6 +60,8 @@ class DaemonSettings:
     """How much of the map may be in memory; None for all of it."""
     limits: IntakeLimits = field(default_factory=IntakeLimits)
     """What may wait at the input."""
+    metrics_port: int | None = None
+    """Loopback port of the Prometheus metrics; None for none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +107,7 @@ class Daemon:
             on_open: Called when input is taken.
 
         Raises:
-            Unavailable: If the endpoints cannot be used.
+            Unavailable: If the endpoints or the port of the metrics cannot be used.
             DaemonFailure: If another daemon serves the same robot.
         """
         settings = self._settings
@@ -111,6 +115,7 @@ class Daemon:
             _refuse_second(session, settings.keys)
             pipeline = Pipeline(
                 settings.config,
+                encode=encode,
                 seed=settings.seed,
                 save=settings.save,
                 keeper=settings.keeper,
@@ -127,9 +132,10 @@ class Daemon:
             pipeline.start(gateway)
             try:
                 gateway.open()
-                on_open()
-                failure = self._serve(gateway, pipeline)
-                return self._stop(gateway, pipeline, failure)
+                with metrics_server(settings.metrics_port, settings.keys, gateway.status):
+                    on_open()
+                    failure = self._serve(gateway, pipeline)
+                    return self._stop(gateway, pipeline, failure)
             finally:
                 pipeline.stop(0.0)
 

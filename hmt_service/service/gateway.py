@@ -10,6 +10,7 @@ References:
 from __future__ import annotations
 
 import logging
+import math
 import os
 import threading
 import time
@@ -21,10 +22,19 @@ import zenoh
 from hmt_service import __version__
 from hmt_service.core.audit import Audit, belief_of
 from hmt_service.core.config import Config
-from hmt_service.core.types import Event, EventKind, History, MapMethod, Snapshot, Tracking
-from hmt_service.errors import DaemonFailure, HmtError, Unavailable
+from hmt_service.core.types import (
+    Event,
+    EventKind,
+    History,
+    Hypotheses,
+    MapMethod,
+    Snapshot,
+    Tracking,
+)
+from hmt_service.errors import DaemonFailure, HmtError, InvalidInput, Unavailable
 from hmt_service.runtime.localization import Localizer
 from hmt_service.runtime.messages import (
+    AreaRequest,
     CompareRequest,
     Finish,
     Finished,
@@ -33,23 +43,26 @@ from hmt_service.runtime.messages import (
     ProcessFailure,
     ProcessName,
     Request,
-    Result,
     RunReport,
     SaveRequest,
+    TrajectoryRequest,
 )
 from hmt_service.runtime.pipeline import Pipeline
 from hmt_service.service.codec import Value, encode
+from hmt_service.service.delivery import Deliveries
 from hmt_service.service.intake import Intake, IntakeLimits
 from hmt_service.service.keys import Call, Control, Input, Keys, Topic
 from hmt_service.service.questions import Name, Question, receive
 from hmt_service.service.reports import Ack, DaemonState, Status
+from hmt_service.service.senders import Senders
 
 _LOG = logging.getLogger(__name__)
 _WARNINGS = (EventKind.PRESET_DOUBTED, EventKind.NOT_SAVED)
 _KEPT_EVENTS = 1000
 _KEPT_BELIEFS = 20_000
 _ANSWER_S = 8.0
-"""Longest time for a slow call: less than clients wait, so that they learn the reason."""
+"""Time for a slow call of a client that says no deadline: less than Zenoh's own ten seconds, so
+that it learns the reason."""
 _REPORT_S = 1.0
 """Shortest time between two events about refused input."""
 
@@ -84,6 +97,8 @@ class Gateway:
         self._shut_down = shut_down
         self._intake = Intake(config.sensor, limits, submit=pipeline.submit, finish=pipeline.finish)
         self._localizer = Localizer()
+        self._deliveries = Deliveries()
+        self._senders = Senders()
         self._snapshot: Snapshot | None = None
         self._report = RunReport(0, 0.0, 0.0)
         self._audit = Audit(events=_KEPT_EVENTS, beliefs=_KEPT_BELIEFS)
@@ -194,8 +209,10 @@ class Gateway:
             arcs=snapshot.arcs if snapshot else 0,
             keyframes=snapshot.keyframes if snapshot else 0,
             hypotheses=len(snapshot.posterior.hypotheses) if snapshot else 0,
+            hypothesis=snapshot.posterior.hypotheses[0].hypothesis if snapshot else None,
             stored_keyframes=self._report.stored_keyframes,
             localization=snapshot.localization if snapshot else None,
+            senders=self._senders.counts(),
         )
 
     def on_tracking(self, tracking: Tracking) -> None:
@@ -247,6 +264,8 @@ class Gateway:
     def _on_sample(self, sample: zenoh.Sample) -> None:
         name = str(sample.key_expr).rpartition("/")[2]
         is_known = sample.kind == zenoh.SampleKind.PUT and name in set(Input)
+        if is_known and sample.attachment is not None:
+            self._senders.note(Input(name), sample.attachment.to_bytes())
         self._intake.offer(
             Input(name) if is_known else None,
             len(sample.payload),
@@ -263,7 +282,7 @@ class Gateway:
     def _handle_call(self, question: Question[Call]) -> Value | None:
         match question.name:
             case Call.MAP:
-                question.allow("method", "reference", "hypothesis", "points")
+                question.allow("method", "reference", "hypothesis", "points", "known")
                 return self._ask(
                     question,
                     MapRequest(
@@ -271,8 +290,15 @@ class Gateway:
                         question.integer("reference"),
                         question.integer("hypothesis"),
                         with_points=question.integer("points") != 0,
+                        known=question.versions("known"),
                     ),
                 )
+            case Call.AREA:
+                question.allow("area", "reference", "hypothesis", "points", "known")
+                return self._ask(question, _area_request(question))
+            case Call.TRAJECTORY:
+                question.allow("from", "to", "hypothesis")
+                return self._ask(question, _trajectory_request(question))
             case Call.AREAS:
                 question.allow("reference", "hypothesis")
                 return self._ask(
@@ -315,7 +341,11 @@ class Gateway:
             case Call.EVENTS:
                 return self._audit.events
             case Call.HISTORY:
-                return History(self._audit.beliefs)
+                revision = self._snapshot.posterior.revision if self._snapshot else 0
+                return History(revision, self._audit.beliefs)
+            case Call.HYPOTHESES if self._snapshot is not None:
+                posterior = self._snapshot.posterior
+                return Hypotheses(posterior.stamp_s, posterior.revision, posterior.hypotheses)
             case Call.POSE if self._localizer.pose is not None:
                 return self._localizer.pose
             case Call.POSTERIOR if self._snapshot is not None:
@@ -325,11 +355,9 @@ class Gateway:
 
     def _ask(self, question: Question[Name], request: Request) -> Value | None:
         """Hand a slow call to the topology process, which has it answered later: no value yet."""
-
-        def on_result(result: Result) -> None:
-            question.answer(self._ack(result) if isinstance(result, tuple) else result)
-
-        self._pipeline.request(request, on_result, timeout_s=_ANSWER_S)
+        timeout_s, part_bytes = question.deadline_s(_ANSWER_S), question.part_bytes
+        on_result = self._deliveries.begin(question, self._ack)
+        self._pipeline.request(request, on_result, timeout_s=timeout_s, part_bytes=part_bytes)
         return None
 
     def _finished_ack(self, finished: Finished) -> Ack | HmtError:
@@ -339,3 +367,25 @@ class Gateway:
         counts = self._intake.counts()
         refused = sum(counts.refused.values())
         return Ack(counts.received, counts.accepted, refused, self._report.scans, files)
+
+
+def _area_request(question: Question[Call]) -> AreaRequest:
+    area = question.integer("area")
+    if area is None:
+        raise InvalidInput("which area? area=IDENTIFIER is missing")
+    return AreaRequest(
+        area,
+        question.integer("reference"),
+        question.integer("hypothesis"),
+        with_points=question.integer("points") != 0,
+        known=question.versions("known"),
+    )
+
+
+def _trajectory_request(question: Question[Call]) -> TrajectoryRequest:
+    start_s, end_s = question.number("from"), question.number("to")
+    return TrajectoryRequest(
+        -math.inf if start_s is None else start_s,
+        math.inf if end_s is None else end_s,
+        question.integer("hypothesis"),
+    )

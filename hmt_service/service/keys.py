@@ -51,8 +51,11 @@ class Call(StrEnum):
     POSTERIOR = "posterior"
     EVENTS = "events"
     HISTORY = "history"
+    HYPOTHESES = "hypotheses"
     MAP = "map"
     AREAS = "areas"
+    AREA = "area"
+    TRAJECTORY = "trajectory"
     COMPARE = "compare"
 
 

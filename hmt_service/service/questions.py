@@ -7,6 +7,7 @@ References:
 from __future__ import annotations
 
 import logging
+import math
 import re
 from collections.abc import Callable, Mapping
 from enum import StrEnum
@@ -15,9 +16,18 @@ from typing import Generic, TypeVar
 import zenoh
 
 from hmt_service.errors import DaemonFailure, HmtError, InvalidInput, NotFound
-from hmt_service.service.codec import Value, encode
+from hmt_service.runtime.messages import Part, Wire
+from hmt_service.service.codec import Value, encode, encode_place
 
 _INTEGER = re.compile(r"[0-9]{1,18}")
+_NUMBER = re.compile(r"-?[0-9]{1,18}(\.[0-9]{1,18})?(e[+-]?[0-9]{1,3})?", re.IGNORECASE)
+DEADLINE, PART_BYTES = "deadline", "part_bytes"
+"""Parameters of every call: s after which nobody waits for the answer any more, and the size of
+the largest part that it may come in."""
+_MOST_DEADLINE_S = 600.0
+_MOST_CHARACTERS = 1_000_000
+"""Length of all parameters: `known` of 50,000 areas."""
+_LEAST_PART_BYTES, _MOST_PART_BYTES = 16_384, 1_048_576
 _LOG = logging.getLogger(__name__)
 
 Name = TypeVar("Name", bound=StrEnum)
@@ -46,7 +56,10 @@ class Question(Generic[Name]):
             raise InvalidInput(f"{query.key_expr} is several calls at once: {', '.join(meant)}")
         self.name = meant[0]
         self._key = keys[self.name]
-        pairs = [pair.partition("=") for pair in str(query.parameters).split(";") if pair]
+        text = str(query.parameters)
+        if len(text) > _MOST_CHARACTERS:
+            raise InvalidInput(f"{len(text)} characters of parameters, {_MOST_CHARACTERS} at most")
+        pairs = [pair.partition("=") for pair in text.split(";") if pair]
         # Names that begin with "_" belong to Zenoh.
         self._parameters = {name: text for name, _, text in pairs if not name.startswith("_")}
 
@@ -56,10 +69,13 @@ class Question(Generic[Name]):
         Raises:
             InvalidInput: If there are.
         """
-        unknown = sorted(self._parameters.keys() - set(names))
+        known = (*names, DEADLINE, PART_BYTES)
+        unknown = sorted(self._parameters.keys() - set(known))
         if unknown:
-            known = f"there are {', '.join(names)}" if names else "there are none"
-            raise InvalidInput(f"unknown parameters of {self.name}: {', '.join(unknown)}; {known}")
+            raise InvalidInput(
+                f"unknown parameters of {self.name}: {', '.join(unknown)}; "
+                f"there are {', '.join(known)}"
+            )
 
     def integer(self, name: str) -> int | None:
         """Return a parameter that is an integer >= 0, or None without it.
@@ -73,6 +89,64 @@ class Question(Generic[Name]):
         if not _INTEGER.fullmatch(text):
             raise InvalidInput(f"{name}={text[:40]!r} is not an integer of 1 to 18 digits")
         return int(text)
+
+    def number(self, name: str) -> float | None:
+        """Return a parameter that is a finite number, or None without it.
+
+        Raises:
+            InvalidInput: If it is none.
+        """
+        text = self._parameters.get(name)
+        if text is None:
+            return None
+        number = float(text) if _NUMBER.fullmatch(text) else math.nan
+        if not math.isfinite(number):
+            raise InvalidInput(f"{name}={text[:40]!r} is not a number")
+        return number
+
+    def versions(self, name: str) -> Mapping[int, int]:
+        """Return a parameter that is a list `area:version,...`; nothing without it.
+
+        Raises:
+            InvalidInput: If it is none.
+        """
+        result = {}
+        for pair in filter(None, self._parameters.get(name, "").split(",")):
+            area, _, version = pair.partition(":")
+            if not _INTEGER.fullmatch(area) or not _INTEGER.fullmatch(version):
+                raise InvalidInput(f"{name} holds {pair[:40]!r}, which is not area:version")
+            result[int(area)] = int(version)
+        return result
+
+    def deadline_s(self, usual_s: float) -> float:
+        """Return how long the answer is waited for, s.
+
+        Args:
+            usual_s: How long if nothing is said about it.
+
+        Raises:
+            InvalidInput: If what is said is not a number in (0, 600].
+        """
+        said_s = self.number(DEADLINE)
+        if said_s is None:
+            return usual_s
+        if not 0.0 < said_s <= _MOST_DEADLINE_S:
+            raise InvalidInput(f"{DEADLINE}={said_s:g} is not in (0, {_MOST_DEADLINE_S:g}] s")
+        return said_s
+
+    @property
+    def part_bytes(self) -> int | None:
+        """Largest part that the answer may come in; None if it must come whole.
+
+        Raises:
+            InvalidInput: If it is out of range.
+        """
+        size = self.integer(PART_BYTES)
+        if size is not None and not _LEAST_PART_BYTES <= size <= _MOST_PART_BYTES:
+            raise InvalidInput(
+                f"{PART_BYTES}={size} is not in [{_LEAST_PART_BYTES}, {_MOST_PART_BYTES}]"
+            )
+        return size
 
     def choice(self, name: str, default: Choice) -> Choice:
         """Return a parameter that is one of the values of the default's type.
@@ -89,6 +163,20 @@ class Question(Generic[Name]):
     def answer(self, value: Value | HmtError) -> None:
         """Send the answer, or the error, and be done with the query."""
         _reply(self._query, self._key, value)
+
+    def reply(self, answer: Wire) -> None:
+        """Send an answer that is already encoded, and be done with the query."""
+        with self._query:
+            self._query.reply(self._key, answer.payload, encoding=answer.encoding)
+
+    def reply_part(self, part: Part) -> None:
+        """Send a part of the answer; with the last one be done with the query."""
+        place = encode_place(part)
+        self._query.reply(
+            self._key, part.wire.payload, encoding=part.wire.encoding, attachment=place
+        )
+        if part.is_last:
+            self._query.drop()
 
 
 def receive(

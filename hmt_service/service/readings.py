@@ -12,7 +12,8 @@ from hmt_service.core.config import SensorConfig
 from hmt_service.core.types import Reading
 from hmt_service.io import foxglove
 from hmt_service.io.foxglove import Decoded, Defect
-from hmt_service.service.codec import PREFIX, Wire, wire
+from hmt_service.runtime.messages import Wire
+from hmt_service.service.codec import PREFIX, wire
 from hmt_service.service.keys import Input
 
 

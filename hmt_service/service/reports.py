@@ -12,6 +12,7 @@ from enum import StrEnum
 
 from hmt_service.core.types import Localization
 from hmt_service.runtime.messages import ProcessStatus
+from hmt_service.service.keys import Input
 
 
 class DaemonState(StrEnum):
@@ -48,6 +49,20 @@ class InputCounts:
 
 
 @dataclass(frozen=True, slots=True)
+class SenderCounts:
+    """What arrived of one sender under one key."""
+
+    sender: int
+    """Number that it has drawn for itself."""
+    input: Input
+    """What it sends."""
+    received: int
+    """Samples that arrived."""
+    lost: int
+    """Samples before the last one of these that did not."""
+
+
+@dataclass(frozen=True, slots=True)
 class Status:
     """Everything that an operator may ask of the daemon."""
 
@@ -77,10 +92,14 @@ class Status:
     """Keyframes in the map."""
     hypotheses: int
     """Hypotheses alive."""
+    hypothesis: int | None
+    """The best one; None before the first keyframe."""
     stored_keyframes: int
     """Keyframes that are in the map file, whatever happens now; zero without one."""
     localization: Localization | None
     """How sure it is where the robot is; None before the first keyframe."""
+    senders: tuple[SenderCounts, ...]
+    """What arrived of senders that number what they send; of the last hundred."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,8 +8,8 @@ import psutil
 import pytest
 
 from benchmarks.serving import serving
+from hmt_service.client import HmtClient
 from hmt_service.errors import DaemonFailure, Unavailable
-from hmt_service.service.client import HmtClient
 
 DEADLINE_S = 10.0
 

@@ -13,6 +13,8 @@ from typer.testing import CliRunner, Result
 
 from hmt_service.cli.app import app
 from hmt_service.cli.plain import to_json
+from hmt_service.client import HmtClient
+from hmt_service.client.local import free_endpoint
 from hmt_service.core.config import load_config
 from hmt_service.core.engine import Engine
 from hmt_service.core.odometry import Odometry
@@ -20,8 +22,6 @@ from hmt_service.errors import NotFound, Unavailable
 from hmt_service.io.logs import read_log
 from hmt_service.io.mcap_log import McapWriter
 from hmt_service.io.trajectory import read_tum
-from hmt_service.service.client import HmtClient
-from hmt_service.service.local import free_endpoint
 from tests.flat import SETTINGS, path, ranges_from, readings
 from tests.service.harness import RunningDaemon, as_received, running_daemon
 

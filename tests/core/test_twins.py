@@ -127,7 +127,7 @@ def position_error_m(
 ) -> FloatArray:
     if hypothesis.current.area_from_visit is None:
         return np.full(2, np.inf)
-    poses = hypothesis.keyframe_poses(engine._visits)
+    poses = hypothesis.keyframe_poses(engine._visits.values())
     near = int(np.argmin(np.linalg.norm(poses[:mapped, :3, 3] - poses[-1, :3, 3], axis=1)))
     believed_pose = truth[near] @ inverse(poses[near]) @ poses[-1]
     return np.asarray(believed_pose[:2, 3] - truth[-1][:2, 3])

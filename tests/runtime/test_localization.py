@@ -34,9 +34,9 @@ def tracking(keyframe: int, motion: Pose, *, becomes_keyframe: bool = False) -> 
 
 def snapshot(keyframe: int, area_from_keyframe: Pose, *, area: int = 7) -> Snapshot:
     summaries = (
-        HypothesisSummary(3, 0.6, area, (0, area), 8, 0),
-        HypothesisSummary(4, 0.3, area, (0, 1, area), 9, 0),
-        HypothesisSummary(5, 0.1, 0, (0, 1, 0), 8, 1),
+        HypothesisSummary(3, 0.6, area, (0, area), 8, 0, 7),
+        HypothesisSummary(4, 0.3, area, (0, 1, area), 9, 0, 8),
+        HypothesisSummary(5, 0.1, 0, (0, 1, 0), 8, 1, 7),
     )
     posterior = Posterior(float(keyframe), 11, summaries, {area: 0.9, 0: 0.1}, 2.0)
     reference_from_keyframe = planar_pose(100.0, 0.0, 0.0) @ area_from_keyframe

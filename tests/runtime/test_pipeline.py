@@ -10,23 +10,31 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from hmt_service.core.config import Config, load_config
 from hmt_service.core.engine import Engine
 from hmt_service.core.odometry import Odometry
 from hmt_service.core.types import Event, GlobalMap, MapMethod, Reading, Scan, Tracking
-from hmt_service.errors import DaemonFailure, DeadlineExceeded, NotFound, Unavailable
+from hmt_service.errors import DaemonFailure, DeadlineExceeded, HmtError, NotFound, Unavailable
 from hmt_service.runtime.messages import (
+    Answer,
     CompareRequest,
     Finish,
     Finished,
     Mapped,
     MapRequest,
+    Part,
     ProcessName,
     Request,
     Result,
     RunReport,
     SaveRequest,
+    Wire,
+    dump,
+    load,
+    parts_of,
 )
 from hmt_service.runtime.pipeline import Pipeline
 from tests.flat import SETTINGS, readings
@@ -79,19 +87,38 @@ class Recorder:
         return self.finished[-1]
 
 
-class Answers:
-    """Collects the one answer to a request."""
+def encode(answer: Answer) -> Wire:
+    """Stand for the messages of the service."""
+    return Wire(dump(answer), type(answer).__name__)
 
-    def __init__(self, pipeline: Pipeline, request: Request, timeout_s: float = DEADLINE_S) -> None:
-        self.results: list[Result] = []
+
+class Answers:
+    """Collects the one answer to a request, which may come in parts."""
+
+    def __init__(
+        self,
+        pipeline: Pipeline,
+        request: Request,
+        timeout_s: float = DEADLINE_S,
+        part_bytes: int | None = None,
+    ) -> None:
+        self.results: list[Answer | tuple[str, ...] | HmtError] = []
+        self.parts: list[Part] = []
         self._is_there = threading.Event()
-        pipeline.request(request, self._take, timeout_s=timeout_s)
+        pipeline.request(request, self._take, timeout_s=timeout_s, part_bytes=part_bytes)
 
     def _take(self, result: Result) -> None:
-        self.results.append(result)
+        if not isinstance(result, Part):
+            self.results.append(result)
+        else:
+            self.parts.append(result)
+            if not result.is_last:
+                return
+            assert [part.number for part in self.parts] == list(range(result.count))
+            self.results.append(load(b"".join(part.wire.payload for part in self.parts)))
         self._is_there.set()
 
-    def wait(self) -> Result:
+    def wait(self) -> Answer | tuple[str, ...] | HmtError:
         assert self._is_there.wait(DEADLINE_S)
         return self.results[0]
 
@@ -124,7 +151,7 @@ def config() -> Config:
 
 @pytest.fixture
 def running(config: Config) -> Iterator[Running]:
-    pipeline, recorder = Pipeline(config, save=save_area_count), Recorder()
+    pipeline, recorder = Pipeline(config, encode=encode, save=save_area_count), Recorder()
     pipeline.start(recorder)
     yield Running(pipeline, recorder)
     pipeline.stop(0.0)
@@ -204,6 +231,43 @@ def test_a_late_answer_is_an_error_and_the_next_one_belongs_to_its_question(
     assert len(late.results) == 1
 
 
+def test_an_answer_comes_in_parts_and_counts_once(running: Running) -> None:
+    running.feed(readings(20))
+    running.finish()
+    request = MapRequest(MapMethod.CONSISTENT)
+    pieces = [Answers(running.pipeline, request, part_bytes=1000) for _ in range(5)]
+    whole = Answers(running.pipeline, request)
+    expected = whole.wait()
+    assert isinstance(expected, GlobalMap)
+    assert len(whole.parts) == 1
+    for one in pieces:
+        answer = one.wait()
+        assert isinstance(answer, GlobalMap)
+        assert len(one.parts) > 2
+        assert all(len(part.wire.payload) <= 1000 for part in one.parts)
+        np.testing.assert_array_equal(
+            answer.areas[0].points_in_area, expected.areas[0].points_in_area
+        )
+
+
+def test_what_nobody_waits_for_any_more_is_not_worked_on(running: Running) -> None:
+    running.feed(readings(20))
+    running.finish()
+    late = Answers(running.pipeline, SaveRequest(), timeout_s=-1.0).wait()
+    assert isinstance(late, DeadlineExceeded)
+    assert "until its deadline" in str(late)
+
+
+@given(st.binary(max_size=50), st.integers(1, 60))
+def test_parts_joined_are_the_whole(payload: bytes, part_bytes: int) -> None:
+    parts = list(parts_of(Wire(payload, "bytes"), part_bytes))
+    assert b"".join(part.wire.payload for part in parts) == payload
+    assert [part.number for part in parts] == list(range(len(parts)))
+    assert {part.count for part in parts} == {len(parts)}
+    assert [part.is_last for part in parts] == [False] * (len(parts) - 1) + [True]
+    assert all(len(part.wire.payload) <= part_bytes for part in parts)
+
+
 def test_too_many_questions_at_once_are_refused(running: Running) -> None:
     running.feed(readings(20))
     asked = [
@@ -245,7 +309,10 @@ def test_the_map_is_saved_before_it_is_smoothed(
     config: Config, tmp_path: Path, is_urgent: bool, saves: int
 ) -> None:
     log = tmp_path / "saved"
-    pipeline, recorder = Pipeline(config, save=partial(append_trajectory, log)), Recorder()
+    pipeline, recorder = (
+        Pipeline(config, encode=encode, save=partial(append_trajectory, log)),
+        Recorder(),
+    )
     pipeline.start(recorder)
     running = Running(pipeline, recorder)
     running.feed(readings(60))
@@ -262,7 +329,7 @@ def test_submit_returns_false_instead_of_waiting_for_a_dead_process(running: Run
 
 
 def test_a_map_that_cannot_be_saved_is_reported_and_kept(config: Config) -> None:
-    pipeline, recorder = Pipeline(config, save=fail_to_save), Recorder()
+    pipeline, recorder = Pipeline(config, encode=encode, save=fail_to_save), Recorder()
     pipeline.start(recorder)
     running = Running(pipeline, recorder)
     running.feed(readings(20))
@@ -294,7 +361,7 @@ def test_questions_without_end_do_not_stop_the_map(running: Running) -> None:
 
 
 def test_a_bug_in_an_answer_costs_the_answer_and_not_the_map(config: Config) -> None:
-    pipeline, recorder = Pipeline(config, save=stumble), Recorder()
+    pipeline, recorder = Pipeline(config, encode=encode, save=stumble), Recorder()
     pipeline.start(recorder)
     running = Running(pipeline, recorder)
     running.feed(readings(20))

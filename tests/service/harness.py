@@ -10,11 +10,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+from hmt_service.client import HmtClient
+from hmt_service.client.local import free_endpoint, is_running
 from hmt_service.core.config import Preset, SensorConfig
 from hmt_service.core.types import Reading
 from hmt_service.io import foxglove
-from hmt_service.service.client import HmtClient
-from hmt_service.service.local import free_endpoint, is_running
 from tests.flat import SETTINGS
 
 DEADLINE_S = 20.0

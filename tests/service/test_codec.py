@@ -13,7 +13,9 @@ from hmt_service.core.geometry import GaussianPose, exp
 from hmt_service.core.types import (
     Arc,
     ArcResidual,
+    AreaDetails,
     AreaDifference,
+    AreaVisit,
     Belief,
     Comparison,
     Event,
@@ -21,11 +23,14 @@ from hmt_service.core.types import (
     GlobalMap,
     History,
     HmtPose,
+    Hypotheses,
     HypothesisSummary,
     Localization,
     MapMethod,
     PlacedArea,
     Posterior,
+    StampedPose,
+    Trajectory,
 )
 from hmt_service.errors import (
     DaemonFailure,
@@ -37,7 +42,8 @@ from hmt_service.errors import (
 )
 from hmt_service.runtime.messages import ProcessName, ProcessStatus
 from hmt_service.service.codec import Value, decode, encode
-from hmt_service.service.reports import Ack, DaemonState, InputCounts, Status
+from hmt_service.service.keys import Input
+from hmt_service.service.reports import Ack, DaemonState, InputCounts, SenderCounts, Status
 
 reals = st.floats(-1e6, 1e6)
 shares = st.floats(0.0, 1.0)
@@ -67,8 +73,9 @@ poses = st.builds(
     st.integers(0, 2**60),
 )
 summaries = st.builds(
-    HypothesisSummary, ids, shares, ids, st.lists(ids, max_size=5).map(tuple), ids, ids
+    HypothesisSummary, ids, shares, ids, st.lists(ids, max_size=5).map(tuple), ids, ids, ids
 )
+hypotheses = st.builds(Hypotheses, reals, counts, st.lists(summaries, max_size=3).map(tuple))
 posteriors = st.builds(
     Posterior,
     reals,
@@ -77,11 +84,33 @@ posteriors = st.builds(
     st.dictionaries(ids, shares, max_size=4),
     reals,
 )
-histories = st.lists(
-    st.builds(Belief, reals, st.dictionaries(ids, shares, max_size=4), reals), max_size=3
-).map(lambda beliefs: History(tuple(beliefs)))
+beliefs = st.builds(Belief, reals, st.dictionaries(ids, shares, max_size=4), reals)
+histories = st.builds(History, counts, st.lists(beliefs, max_size=3).map(tuple))
 clouds = st.lists(st.tuples(*[st.floats(-1e4, 1e4, width=32)] * 3), max_size=4).map(
     lambda rows: np.array(rows, dtype=np.float32).reshape(-1, 3)
+)
+areas = st.builds(PlacedArea, ids, gaussians(), ids, ids, clouds, st.integers(0, 2**48 - 1))
+arcs = st.builds(Arc, ids, ids, gaussians(), ids)
+transforms = tangents.map(lambda tangent: exp(np.array(tangent)))
+area_visits = st.builds(AreaVisit, ids, transforms, reals, ids, st.booleans())
+area_details = st.builds(
+    AreaDetails,
+    ids,
+    ids,
+    shares,
+    counts,
+    areas,
+    st.lists(area_visits, max_size=2).map(tuple),
+    st.lists(arcs, max_size=2).map(tuple),
+)
+trajectories = st.builds(
+    Trajectory,
+    ids,
+    ids,
+    shares,
+    counts,
+    st.booleans(),
+    st.lists(st.builds(StampedPose, reals, transforms), max_size=3).map(tuple),
 )
 maps = st.builds(
     GlobalMap,
@@ -90,8 +119,8 @@ maps = st.builds(
     ids,
     shares,
     counts,
-    st.lists(st.builds(PlacedArea, ids, gaussians(), ids, ids, clouds), max_size=2).map(tuple),
-    st.lists(st.builds(Arc, ids, ids, gaussians(), ids), max_size=2).map(tuple),
+    st.lists(areas, max_size=2).map(tuple),
+    st.lists(arcs, max_size=2).map(tuple),
 )
 comparisons = st.builds(
     Comparison,
@@ -126,8 +155,12 @@ statuses = st.builds(
     ids,
     ids,
     ids,
+    st.none() | ids,
     ids,
     st.none() | localizations,
+    st.lists(
+        st.builds(SenderCounts, counts, st.sampled_from(Input), counts, counts), max_size=2
+    ).map(tuple),
 )
 acks = st.builds(Ack, counts, counts, counts, counts, st.lists(texts, max_size=3).map(tuple))
 
@@ -150,8 +183,14 @@ def assert_same(mine: object, theirs: object) -> None:
         assert mine == theirs
 
 
-@given(poses | posteriors | histories | maps | comparisons | events | statuses | acks)
+@given(poses | posteriors | hypotheses | histories | maps | comparisons | events | statuses | acks)
 def test_values_come_back_as_they_were(value: Value) -> None:
+    message = encode(value)
+    assert_same(decode(message.payload, message.encoding), value)
+
+
+@given(area_details | trajectories)
+def test_details_come_back_as_they_were(value: Value) -> None:
     message = encode(value)
     assert_same(decode(message.payload, message.encoding), value)
 

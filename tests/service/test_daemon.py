@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hmt_service.client import HmtClient
 from hmt_service.core.config import load_config
 from hmt_service.core.engine import Engine
 from hmt_service.core.geometry import planar_pose
@@ -15,7 +16,6 @@ from hmt_service.core.odometry import Odometry
 from hmt_service.core.types import MapMethod, OdometryReading, Reading, Scan
 from hmt_service.errors import HmtError, InvalidInput, NotFound, Unavailable
 from hmt_service.io.trajectory import read_tum
-from hmt_service.service.client import HmtClient
 from hmt_service.service.codec import decode
 from hmt_service.service.keys import Input
 from hmt_service.service.readings import encode_reading
@@ -33,7 +33,14 @@ def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningDaemon]:
     """Return a daemon that has mapped the flat."""
     with running_daemon(tmp_path_factory.mktemp("daemon") / "out") as daemon:
         with daemon.client() as client:
-            for call in (client.pose, client.posterior, client.map, client.compare):
+            for call in (
+                client.pose,
+                client.posterior,
+                client.hypotheses,
+                client.map,
+                client.trajectory,
+                client.compare,
+            ):
                 with pytest.raises(Unavailable, match="keyframe"):
                     call()
             for reading in readings(SCANS):
@@ -172,6 +179,15 @@ def ask(daemon: RunningDaemon, selector: str) -> HmtError | None:
         ("ro/compare?method=consistent", InvalidInput, "method"),
         ("ro/areas?points=1", InvalidInput, "points"),
         ("ro/status?reference=1", InvalidInput, "reference"),
+        ("ro/map?known=1", InvalidInput, "area:version"),
+        ("ro/map?deadline=-1", InvalidInput, "deadline"),
+        ("ro/map?part_bytes=1", InvalidInput, "part_bytes"),
+        ("ro/area", InvalidInput, "area=IDENTIFIER"),
+        ("ro/area?area=4711", NotFound, "4711"),
+        ("ro/area?area=0;reference=4711", NotFound, "4711"),
+        ("ro/hypotheses?hypothesis=0", InvalidInput, "hypothesis"),
+        ("ro/trajectory?from=yesterday", InvalidInput, "yesterday"),
+        ("ro/trajectory?hypothesis=4711", NotFound, "4711"),
         ("ro/everything", NotFound, "everything"),
         ("ro/*", InvalidInput, "several"),
         ("@ctl/explode", NotFound, "explode"),

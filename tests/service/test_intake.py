@@ -7,8 +7,8 @@ import pytest
 
 from hmt_service.core.config import SensorConfig
 from hmt_service.core.types import OdometryReading, Reading, Scan
-from hmt_service.runtime.messages import Finish
-from hmt_service.service.codec import Wire, encoding_of
+from hmt_service.runtime.messages import Finish, Wire
+from hmt_service.service.codec import encoding_of
 from hmt_service.service.intake import Intake, IntakeLimits
 from hmt_service.service.keys import Input
 from hmt_service.service.readings import encode_reading

@@ -18,6 +18,7 @@ from typer.testing import CliRunner
 
 from hmt_service.cli.app import app
 from hmt_service.cli.serve import NOT_SAVED
+from hmt_service.client import HmtClient
 from hmt_service.core.config import load_config
 from hmt_service.core.geometry import inverse
 from hmt_service.core.odometry import Odometry
@@ -26,7 +27,6 @@ from hmt_service.errors import InvalidInput
 from hmt_service.io.map_check import check_map
 from hmt_service.io.map_file import read_map, write_map
 from hmt_service.runtime.messages import ProcessName
-from hmt_service.service.client import HmtClient
 from hmt_service.service.kept_map import KeptMap
 from tests.flat import path, readings
 from tests.mapped import map_file_in, mapped

@@ -18,15 +18,15 @@ from typer.testing import CliRunner
 
 from hmt_service.cli.app import app
 from hmt_service.cli.serve import PROCESS_FAILED
+from hmt_service.client import HmtClient
+from hmt_service.client.local import free_endpoint
 from hmt_service.core.config import Preset
 from hmt_service.core.types import Event, EventKind
 from hmt_service.errors import DaemonFailure, HmtError, Unavailable
 from hmt_service.io.trajectory import read_tum
 from hmt_service.runtime.messages import ProcessName
-from hmt_service.service.client import HmtClient
 from hmt_service.service.codec import decode
 from hmt_service.service.keys import Call, Keys, Topic
-from hmt_service.service.local import free_endpoint
 from hmt_service.service.reports import DaemonState
 from hmt_service.service.session import Endpoints, Mode, open_session
 from tests.flat import readings

@@ -2,10 +2,10 @@ from __future__ import annotations
 
 import pytest
 
+from hmt_service.client import HmtClient
+from hmt_service.client.local import free_endpoint
 from hmt_service.errors import Unavailable
-from hmt_service.service.client import HmtClient
 from hmt_service.service.keys import Input
-from hmt_service.service.local import free_endpoint
 from hmt_service.service.session import Endpoints, Mode, open_session
 
 

@@ -122,20 +122,32 @@ class HmtPose(_message.Message):
     def __init__(self, stamp_s: _Optional[float] = ..., area: _Optional[int] = ..., area_from_body: _Optional[_Union[GaussianPose, _Mapping]] = ..., reference_area: _Optional[int] = ..., reference_from_body: _Optional[_Union[GaussianPose, _Mapping]] = ..., hypothesis: _Optional[int] = ..., probability: _Optional[float] = ..., revision: _Optional[int] = ..., localization: _Optional[_Union[Localization, _Mapping]] = ...) -> None: ...
 
 class HypothesisSummary(_message.Message):
-    __slots__ = ("hypothesis", "probability", "current_area", "topological_path", "areas", "loop_closures")
+    __slots__ = ("hypothesis", "probability", "current_area", "topological_path", "areas", "loop_closures", "arcs")
     HYPOTHESIS_FIELD_NUMBER: _ClassVar[int]
     PROBABILITY_FIELD_NUMBER: _ClassVar[int]
     CURRENT_AREA_FIELD_NUMBER: _ClassVar[int]
     TOPOLOGICAL_PATH_FIELD_NUMBER: _ClassVar[int]
     AREAS_FIELD_NUMBER: _ClassVar[int]
     LOOP_CLOSURES_FIELD_NUMBER: _ClassVar[int]
+    ARCS_FIELD_NUMBER: _ClassVar[int]
     hypothesis: int
     probability: float
     current_area: int
     topological_path: _containers.RepeatedScalarFieldContainer[int]
     areas: int
     loop_closures: int
-    def __init__(self, hypothesis: _Optional[int] = ..., probability: _Optional[float] = ..., current_area: _Optional[int] = ..., topological_path: _Optional[_Iterable[int]] = ..., areas: _Optional[int] = ..., loop_closures: _Optional[int] = ...) -> None: ...
+    arcs: int
+    def __init__(self, hypothesis: _Optional[int] = ..., probability: _Optional[float] = ..., current_area: _Optional[int] = ..., topological_path: _Optional[_Iterable[int]] = ..., areas: _Optional[int] = ..., loop_closures: _Optional[int] = ..., arcs: _Optional[int] = ...) -> None: ...
+
+class Hypotheses(_message.Message):
+    __slots__ = ("stamp_s", "revision", "hypotheses")
+    STAMP_S_FIELD_NUMBER: _ClassVar[int]
+    REVISION_FIELD_NUMBER: _ClassVar[int]
+    HYPOTHESES_FIELD_NUMBER: _ClassVar[int]
+    stamp_s: float
+    revision: int
+    hypotheses: _containers.RepeatedCompositeFieldContainer[HypothesisSummary]
+    def __init__(self, stamp_s: _Optional[float] = ..., revision: _Optional[int] = ..., hypotheses: _Optional[_Iterable[_Union[HypothesisSummary, _Mapping]]] = ...) -> None: ...
 
 class Posterior(_message.Message):
     __slots__ = ("stamp_s", "revision", "hypotheses", "current_area", "effective_sample_size")
@@ -159,18 +171,20 @@ class Posterior(_message.Message):
     def __init__(self, stamp_s: _Optional[float] = ..., revision: _Optional[int] = ..., hypotheses: _Optional[_Iterable[_Union[HypothesisSummary, _Mapping]]] = ..., current_area: _Optional[_Mapping[int, float]] = ..., effective_sample_size: _Optional[float] = ...) -> None: ...
 
 class PlacedArea(_message.Message):
-    __slots__ = ("area", "reference_from_area", "keyframes", "visits", "points_in_area")
+    __slots__ = ("area", "reference_from_area", "keyframes", "visits", "points_in_area", "version")
     AREA_FIELD_NUMBER: _ClassVar[int]
     REFERENCE_FROM_AREA_FIELD_NUMBER: _ClassVar[int]
     KEYFRAMES_FIELD_NUMBER: _ClassVar[int]
     VISITS_FIELD_NUMBER: _ClassVar[int]
     POINTS_IN_AREA_FIELD_NUMBER: _ClassVar[int]
+    VERSION_FIELD_NUMBER: _ClassVar[int]
     area: int
     reference_from_area: GaussianPose
     keyframes: int
     visits: int
     points_in_area: bytes
-    def __init__(self, area: _Optional[int] = ..., reference_from_area: _Optional[_Union[GaussianPose, _Mapping]] = ..., keyframes: _Optional[int] = ..., visits: _Optional[int] = ..., points_in_area: _Optional[bytes] = ...) -> None: ...
+    version: int
+    def __init__(self, area: _Optional[int] = ..., reference_from_area: _Optional[_Union[GaussianPose, _Mapping]] = ..., keyframes: _Optional[int] = ..., visits: _Optional[int] = ..., points_in_area: _Optional[bytes] = ..., version: _Optional[int] = ...) -> None: ...
 
 class Arc(_message.Message):
     __slots__ = ("area_a", "area_b", "a_from_b", "traversals")
@@ -201,6 +215,74 @@ class GlobalMap(_message.Message):
     areas: _containers.RepeatedCompositeFieldContainer[PlacedArea]
     arcs: _containers.RepeatedCompositeFieldContainer[Arc]
     def __init__(self, method: _Optional[_Union[MapMethod, str]] = ..., reference_area: _Optional[int] = ..., hypothesis: _Optional[int] = ..., probability: _Optional[float] = ..., revision: _Optional[int] = ..., areas: _Optional[_Iterable[_Union[PlacedArea, _Mapping]]] = ..., arcs: _Optional[_Iterable[_Union[Arc, _Mapping]]] = ...) -> None: ...
+
+class Pose(_message.Message):
+    __slots__ = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
+    X_M_FIELD_NUMBER: _ClassVar[int]
+    Y_M_FIELD_NUMBER: _ClassVar[int]
+    Z_M_FIELD_NUMBER: _ClassVar[int]
+    QX_FIELD_NUMBER: _ClassVar[int]
+    QY_FIELD_NUMBER: _ClassVar[int]
+    QZ_FIELD_NUMBER: _ClassVar[int]
+    QW_FIELD_NUMBER: _ClassVar[int]
+    x_m: float
+    y_m: float
+    z_m: float
+    qx: float
+    qy: float
+    qz: float
+    qw: float
+    def __init__(self, x_m: _Optional[float] = ..., y_m: _Optional[float] = ..., z_m: _Optional[float] = ..., qx: _Optional[float] = ..., qy: _Optional[float] = ..., qz: _Optional[float] = ..., qw: _Optional[float] = ...) -> None: ...
+
+class AreaVisit(_message.Message):
+    __slots__ = ("visit", "area_from_visit", "last_stamp_s", "keyframes", "is_forgotten")
+    VISIT_FIELD_NUMBER: _ClassVar[int]
+    AREA_FROM_VISIT_FIELD_NUMBER: _ClassVar[int]
+    LAST_STAMP_S_FIELD_NUMBER: _ClassVar[int]
+    KEYFRAMES_FIELD_NUMBER: _ClassVar[int]
+    IS_FORGOTTEN_FIELD_NUMBER: _ClassVar[int]
+    visit: int
+    area_from_visit: Pose
+    last_stamp_s: float
+    keyframes: int
+    is_forgotten: bool
+    def __init__(self, visit: _Optional[int] = ..., area_from_visit: _Optional[_Union[Pose, _Mapping]] = ..., last_stamp_s: _Optional[float] = ..., keyframes: _Optional[int] = ..., is_forgotten: _Optional[bool] = ...) -> None: ...
+
+class AreaDetails(_message.Message):
+    __slots__ = ("reference_area", "hypothesis", "probability", "revision", "area", "visits", "arcs")
+    REFERENCE_AREA_FIELD_NUMBER: _ClassVar[int]
+    HYPOTHESIS_FIELD_NUMBER: _ClassVar[int]
+    PROBABILITY_FIELD_NUMBER: _ClassVar[int]
+    REVISION_FIELD_NUMBER: _ClassVar[int]
+    AREA_FIELD_NUMBER: _ClassVar[int]
+    VISITS_FIELD_NUMBER: _ClassVar[int]
+    ARCS_FIELD_NUMBER: _ClassVar[int]
+    reference_area: int
+    hypothesis: int
+    probability: float
+    revision: int
+    area: PlacedArea
+    visits: _containers.RepeatedCompositeFieldContainer[AreaVisit]
+    arcs: _containers.RepeatedCompositeFieldContainer[Arc]
+    def __init__(self, reference_area: _Optional[int] = ..., hypothesis: _Optional[int] = ..., probability: _Optional[float] = ..., revision: _Optional[int] = ..., area: _Optional[_Union[PlacedArea, _Mapping]] = ..., visits: _Optional[_Iterable[_Union[AreaVisit, _Mapping]]] = ..., arcs: _Optional[_Iterable[_Union[Arc, _Mapping]]] = ...) -> None: ...
+
+class Trajectory(_message.Message):
+    __slots__ = ("reference_area", "hypothesis", "probability", "revision", "is_smoothed", "stamps_s", "reference_from_body")
+    REFERENCE_AREA_FIELD_NUMBER: _ClassVar[int]
+    HYPOTHESIS_FIELD_NUMBER: _ClassVar[int]
+    PROBABILITY_FIELD_NUMBER: _ClassVar[int]
+    REVISION_FIELD_NUMBER: _ClassVar[int]
+    IS_SMOOTHED_FIELD_NUMBER: _ClassVar[int]
+    STAMPS_S_FIELD_NUMBER: _ClassVar[int]
+    REFERENCE_FROM_BODY_FIELD_NUMBER: _ClassVar[int]
+    reference_area: int
+    hypothesis: int
+    probability: float
+    revision: int
+    is_smoothed: bool
+    stamps_s: _containers.RepeatedScalarFieldContainer[float]
+    reference_from_body: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, reference_area: _Optional[int] = ..., hypothesis: _Optional[int] = ..., probability: _Optional[float] = ..., revision: _Optional[int] = ..., is_smoothed: _Optional[bool] = ..., stamps_s: _Optional[_Iterable[float]] = ..., reference_from_body: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class AreaDifference(_message.Message):
     __slots__ = ("area", "translation_m", "rotation_rad", "sigma_consistent_m", "sigma_shortest_path_m")
@@ -285,10 +367,12 @@ class Belief(_message.Message):
     def __init__(self, stamp_s: _Optional[float] = ..., current_area: _Optional[_Mapping[int, float]] = ..., effective_sample_size: _Optional[float] = ...) -> None: ...
 
 class History(_message.Message):
-    __slots__ = ("beliefs",)
+    __slots__ = ("beliefs", "revision")
     BELIEFS_FIELD_NUMBER: _ClassVar[int]
+    REVISION_FIELD_NUMBER: _ClassVar[int]
     beliefs: _containers.RepeatedCompositeFieldContainer[Belief]
-    def __init__(self, beliefs: _Optional[_Iterable[_Union[Belief, _Mapping]]] = ...) -> None: ...
+    revision: int
+    def __init__(self, beliefs: _Optional[_Iterable[_Union[Belief, _Mapping]]] = ..., revision: _Optional[int] = ...) -> None: ...
 
 class ProcessStatus(_message.Message):
     __slots__ = ("name", "pid", "is_ready", "backlog", "processed", "busy_s")
@@ -340,8 +424,28 @@ class InputCounts(_message.Message):
     dropped_beams: _containers.ScalarMap[str, int]
     def __init__(self, received: _Optional[int] = ..., accepted: _Optional[int] = ..., refused: _Optional[_Mapping[str, int]] = ..., queued: _Optional[int] = ..., queued_bytes: _Optional[int] = ..., discarded: _Optional[int] = ..., reordering: _Optional[int] = ..., dropped_beams: _Optional[_Mapping[str, int]] = ...) -> None: ...
 
+class Origin(_message.Message):
+    __slots__ = ("sender", "number")
+    SENDER_FIELD_NUMBER: _ClassVar[int]
+    NUMBER_FIELD_NUMBER: _ClassVar[int]
+    sender: int
+    number: int
+    def __init__(self, sender: _Optional[int] = ..., number: _Optional[int] = ...) -> None: ...
+
+class SenderCounts(_message.Message):
+    __slots__ = ("sender", "input", "received", "lost")
+    SENDER_FIELD_NUMBER: _ClassVar[int]
+    INPUT_FIELD_NUMBER: _ClassVar[int]
+    RECEIVED_FIELD_NUMBER: _ClassVar[int]
+    LOST_FIELD_NUMBER: _ClassVar[int]
+    sender: int
+    input: str
+    received: int
+    lost: int
+    def __init__(self, sender: _Optional[int] = ..., input: _Optional[str] = ..., received: _Optional[int] = ..., lost: _Optional[int] = ...) -> None: ...
+
 class Status(_message.Message):
-    __slots__ = ("version", "config_hash", "state", "uptime_s", "input", "tracked_scans", "processed_scans", "processes", "revision", "areas", "arcs", "keyframes", "hypotheses", "stored_keyframes", "localization")
+    __slots__ = ("version", "config_hash", "state", "uptime_s", "input", "tracked_scans", "processed_scans", "processes", "revision", "areas", "arcs", "keyframes", "hypotheses", "stored_keyframes", "localization", "hypothesis", "senders")
     VERSION_FIELD_NUMBER: _ClassVar[int]
     CONFIG_HASH_FIELD_NUMBER: _ClassVar[int]
     STATE_FIELD_NUMBER: _ClassVar[int]
@@ -357,6 +461,8 @@ class Status(_message.Message):
     HYPOTHESES_FIELD_NUMBER: _ClassVar[int]
     STORED_KEYFRAMES_FIELD_NUMBER: _ClassVar[int]
     LOCALIZATION_FIELD_NUMBER: _ClassVar[int]
+    HYPOTHESIS_FIELD_NUMBER: _ClassVar[int]
+    SENDERS_FIELD_NUMBER: _ClassVar[int]
     version: str
     config_hash: str
     state: DaemonState
@@ -372,7 +478,9 @@ class Status(_message.Message):
     hypotheses: int
     stored_keyframes: int
     localization: Localization
-    def __init__(self, version: _Optional[str] = ..., config_hash: _Optional[str] = ..., state: _Optional[_Union[DaemonState, str]] = ..., uptime_s: _Optional[float] = ..., input: _Optional[_Union[InputCounts, _Mapping]] = ..., tracked_scans: _Optional[int] = ..., processed_scans: _Optional[int] = ..., processes: _Optional[_Iterable[_Union[ProcessStatus, _Mapping]]] = ..., revision: _Optional[int] = ..., areas: _Optional[int] = ..., arcs: _Optional[int] = ..., keyframes: _Optional[int] = ..., hypotheses: _Optional[int] = ..., stored_keyframes: _Optional[int] = ..., localization: _Optional[_Union[Localization, _Mapping]] = ...) -> None: ...
+    hypothesis: int
+    senders: _containers.RepeatedCompositeFieldContainer[SenderCounts]
+    def __init__(self, version: _Optional[str] = ..., config_hash: _Optional[str] = ..., state: _Optional[_Union[DaemonState, str]] = ..., uptime_s: _Optional[float] = ..., input: _Optional[_Union[InputCounts, _Mapping]] = ..., tracked_scans: _Optional[int] = ..., processed_scans: _Optional[int] = ..., processes: _Optional[_Iterable[_Union[ProcessStatus, _Mapping]]] = ..., revision: _Optional[int] = ..., areas: _Optional[int] = ..., arcs: _Optional[int] = ..., keyframes: _Optional[int] = ..., hypotheses: _Optional[int] = ..., stored_keyframes: _Optional[int] = ..., localization: _Optional[_Union[Localization, _Mapping]] = ..., hypothesis: _Optional[int] = ..., senders: _Optional[_Iterable[_Union[SenderCounts, _Mapping]]] = ...) -> None: ...
 
 class Ack(_message.Message):
     __slots__ = ("received", "accepted", "refused", "processed_scans", "files")
@@ -387,6 +495,14 @@ class Ack(_message.Message):
     processed_scans: int
     files: _containers.RepeatedScalarFieldContainer[str]
     def __init__(self, received: _Optional[int] = ..., accepted: _Optional[int] = ..., refused: _Optional[int] = ..., processed_scans: _Optional[int] = ..., files: _Optional[_Iterable[str]] = ...) -> None: ...
+
+class Part(_message.Message):
+    __slots__ = ("number", "count")
+    NUMBER_FIELD_NUMBER: _ClassVar[int]
+    COUNT_FIELD_NUMBER: _ClassVar[int]
+    number: int
+    count: int
+    def __init__(self, number: _Optional[int] = ..., count: _Optional[int] = ...) -> None: ...
 
 class Error(_message.Message):
     __slots__ = ("code", "message")

@@ -13,8 +13,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import IO
 
+from hmt_service.client.blocking import HmtClient
 from hmt_service.errors import DaemonFailure, Unavailable
-from hmt_service.service.client import HmtClient
 from hmt_service.service.reports import DaemonState
 
 _START_S = 30.0
