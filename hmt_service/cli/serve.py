@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hmt_service.cli.connection import Robot, Site
+from hmt_service.cli.connection import Robot, Site, ZenohConfig
 from hmt_service.cli.settings import (
     BudgetSize,
     ConfigFile,
@@ -45,11 +45,24 @@ def serve(
     robot: Robot = "robot",
     listen: Annotated[
         list[str] | None,
-        typer.Option(help=f"Zenoh endpoint to listen on; {DEFAULT_ENDPOINT} if none is given."),
+        typer.Option(
+            help="Zenoh endpoint to listen on; those of --zenoh-config, or "
+            f"{DEFAULT_ENDPOINT}, if none is given. May be repeated."
+        ),
     ] = None,
     connect: Annotated[
-        list[str] | None, typer.Option(help="Zenoh endpoint to connect to, such as a router's.")
+        list[str] | None,
+        typer.Option(help="Zenoh endpoint to connect to, such as a router's. May be repeated."),
     ] = None,
+    zenoh_config: ZenohConfig = None,
+    allow_unauthenticated: Annotated[
+        bool,
+        typer.Option(
+            "--allow-unauthenticated",
+            help="Let other machines in without asking who they are: to read, to send scans, to "
+            "shut the daemon down.",
+        ),
+    ] = False,
     scouting: Annotated[
         bool, typer.Option("--scouting", help="Look for others on the network by multicast.")
     ] = False,
@@ -88,7 +101,7 @@ def serve(
     from hmt_service.service.daemon import Daemon, DaemonSettings
     from hmt_service.service.intake import IntakeLimits
     from hmt_service.service.results import save_results
-    from hmt_service.service.session import Endpoints, Mode
+    from hmt_service.service.session import daemon_endpoints
 
     console = Console(stderr=True)
     handler = RichHandler(console=console, show_path=False)
@@ -98,13 +111,12 @@ def serve(
     budget = budget_of(memory_budget)
     if map_file is not None and not map_file.absolute().parent.is_dir():
         raise NotFound(f"folder {map_file.absolute().parent} of the map file does not exist")
-    listening = listen or ([] if connect else [DEFAULT_ENDPOINT])
-    endpoints = Endpoints(
-        # A router passes nothing between peers that cannot find each other: be its client.
-        mode=Mode.PEER if listening else Mode.CLIENT,
-        listen=tuple(listening),
-        connect=tuple(connect or []),
+    endpoints = daemon_endpoints(
+        listen or (),
+        connect or (),
         has_scouting=scouting,
+        zenoh_config=zenoh_config,
+        allows_strangers=allow_unauthenticated,
     )
     save = None
     if out is not None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Mapping
+from pathlib import Path
 from types import TracebackType
 from typing import Self, TypeVar, cast
 
@@ -24,12 +25,12 @@ from hmt_service.core.types import (
     Posterior,
     Reading,
 )
-from hmt_service.errors import DeadlineExceeded, HmtError, InvalidInput, Unavailable
+from hmt_service.errors import AccessDenied, DeadlineExceeded, HmtError, InvalidInput, Unavailable
 from hmt_service.service.codec import PREFIX, decode
-from hmt_service.service.keys import DEFAULT_ENDPOINT, Call, Control, Input, Keys
+from hmt_service.service.keys import Call, Control, Input, Keys
 from hmt_service.service.readings import encode_reading
 from hmt_service.service.reports import Ack, Status
-from hmt_service.service.session import Endpoints, Mode, open_session
+from hmt_service.service.session import client_endpoints, open_session
 
 T = TypeVar("T")
 
@@ -39,28 +40,34 @@ class HmtClient:
 
     def __init__(
         self,
-        endpoint: str = DEFAULT_ENDPOINT,
+        endpoint: str | None = None,
         *,
         site: str = "site",
         robot: str = "robot",
         timeout_s: float = 10.0,
+        zenoh_config: Path | None = None,
     ) -> None:
         """Connect.
 
         Args:
-            endpoint: Zenoh endpoint of the daemon, or of a router that reaches it.
+            endpoint: Zenoh endpoint of the daemon, or of a router that reaches it; None for the
+                one that `zenoh_config` names, or `DEFAULT_ENDPOINT`.
             site: Where the robot works.
             robot: Which one it is.
             timeout_s: How long to wait for an answer, wall clock.
+            zenoh_config: File of Zenoh settings: certificates or a password.
 
         Raises:
-            InvalidInput: If a name cannot be part of a key.
-            Unavailable: If nobody listens at the endpoint.
+            InvalidInput: If a name cannot be part of a key, or Zenoh refuses the file.
+            NotFound: If there is no such file.
+            Unavailable: If nobody listens at the endpoint, or does not let this client in.
         """
-        self._endpoint = endpoint
+        endpoints = client_endpoints(
+            endpoint, timeout_s=min(3.0, timeout_s), zenoh_config=zenoh_config
+        )
+        self._endpoint = ", ".join(endpoints.connect)
         self._keys = Keys(site, robot)
         self._timeout_s = timeout_s
-        endpoints = Endpoints(mode=Mode.CLIENT, connect=(endpoint,), timeout_s=min(3.0, timeout_s))
         self._session = open_session(endpoints)
         self._publishers: dict[Input, zenoh.Publisher] = {}
 
@@ -150,7 +157,7 @@ class HmtClient:
             The size of what was sent, bytes.
 
         Raises:
-            Unavailable: If nobody takes it.
+            Unavailable: If nobody takes it, or not from this client.
         """
         message = encode_reading(reading)
         name = Input.ODOMETRY if isinstance(reading, OdometryReading) else Input.SCAN
@@ -161,7 +168,7 @@ class HmtClient:
         """Send any payload as a scan or as odometry.
 
         Raises:
-            Unavailable: If nobody takes it.
+            Unavailable: If nobody takes it, or not from this client.
         """
         if name not in self._publishers:
             self._publishers[name] = self._publisher(self._keys.input(name))
@@ -195,7 +202,8 @@ class HmtClient:
         """Ask, and return the only answer.
 
         Raises:
-            HmtError: The daemon's, or `Unavailable` when there is no daemon.
+            HmtError: The daemon's, `AccessDenied` when it may not be asked this by this client, or
+                `Unavailable` when there is no daemon.
         """
         given = [f"{k}={v}" for k, v in (parameters or {}).items() if v is not None]
         selector = f"{key}?{';'.join(given)}" if given else key
@@ -214,7 +222,8 @@ class HmtClient:
         raise self._nobody(selector)
 
     def _nobody(self, key: str) -> Unavailable:
-        site, robot = self._keys.site, self._keys.robot
-        return Unavailable(
-            f"nobody answers {key} at {self._endpoint}: no daemon of site {site}, robot {robot}"
-        )
+        name = f"daemon of site {self._keys.site}, robot {self._keys.robot}"
+        tokens = self._session.liveliness().get(self._keys.liveliness, timeout=self._timeout_s)
+        if any(reply.ok is not None for reply in tokens):
+            return AccessDenied(f"the {name} is at {self._endpoint}, and {key} is not granted here")
+        return Unavailable(f"nobody answers {key} at {self._endpoint}: no {name}")

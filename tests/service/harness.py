@@ -35,9 +35,11 @@ class RunningDaemon:
     endpoint: str
     out: Path
     process: subprocess.Popen[str]
+    zenoh_config: Path | None = None
+    """What its clients are let in with."""
 
     def client(self) -> HmtClient:
-        return HmtClient(self.endpoint)
+        return HmtClient(self.endpoint, zenoh_config=self.zenoh_config)
 
     def output(self) -> str:
         """Wait for the end and return what was printed."""
@@ -50,6 +52,8 @@ def running_daemon(
     out: Path,
     *,
     router: str | None = None,
+    listen: str | None = None,
+    zenoh_config: Path | None = None,
     is_awaited: bool = True,
     preset: Preset = Preset.PLANAR,
     map_file: Path | None = None,
@@ -60,12 +64,14 @@ def running_daemon(
     Args:
         out: Folder to save to.
         router: Endpoint of a router to reach it through, instead of its own.
+        listen: Its own endpoint; a free one on loopback if not given.
+        zenoh_config: What its clients are let in with.
         is_awaited: Whether it shall be ready for work.
         preset: Kind of sensor that it expects.
         map_file: Map file to go on with.
         options: More of `hmt serve`.
     """
-    endpoint = router or free_endpoint()
+    endpoint = router or listen or free_endpoint()
     settings = out.parent / "settings.yaml"
     settings.write_text(SETTINGS)
     command = [sys.executable, "-m", "hmt_service", "serve", "--out", str(out), *options]
@@ -80,7 +86,7 @@ def running_daemon(
         stderr=subprocess.STDOUT,
         text=True,
     ) as process:
-        daemon = RunningDaemon(endpoint, out, process)
+        daemon = RunningDaemon(endpoint, out, process, zenoh_config)
         try:
             if is_awaited:
                 wait_until(lambda: _is_running(daemon))
@@ -91,7 +97,7 @@ def running_daemon(
 
 def _is_running(daemon: RunningDaemon) -> bool:
     assert daemon.process.poll() is None, daemon.output()
-    return is_running(daemon.endpoint)
+    return is_running(daemon.endpoint, daemon.zenoh_config)
 
 
 def as_received(reading: Reading, sensor: SensorConfig) -> Reading:
