@@ -21,7 +21,7 @@ WORKDIR /data
 VOLUME /data
 
 EXPOSE 7447
-HEALTHCHECK --interval=10s --timeout=5s --start-period=20s CMD ["hmt", "status", "--json"]
+HEALTHCHECK --interval=10s --timeout=5s --start-period=20s CMD ["hmt", "health"]
 ENTRYPOINT ["hmt"]
 # On loopback: run with --network host, or with --listen and --zenoh-config (README, Security).
 CMD ["serve", "--out", "/data/map"]

@@ -1,4 +1,4 @@
-"""`hmt status`, `pose`, `posterior`, `events`, `areas`, `map`, `compare`: ask a daemon.
+"""`hmt status`, `health`, `pose`, `posterior`, `events`, `areas`, `map`, `compare`: ask a daemon.
 
 `posterior` and `events` also read what a run has saved.
 
@@ -33,6 +33,9 @@ if TYPE_CHECKING:
     from hmt_service.service.client import HmtClient
     from hmt_service.service.reports import Status
 
+NOT_RUNNING = 1
+"""Exit code of `hmt health` for a daemon that is there and takes no work."""
+
 Run = Annotated[
     Path | None,
     typer.Argument(
@@ -58,6 +61,25 @@ def status(
         answer = client.status()
     if not _print_json(answer, is_wanted=as_json):
         _print(_pairs(f"{site}/{robot}", _status_rows(answer)))
+
+
+def health(
+    connect: Connect = None,
+    site: Site = "site",
+    robot: Robot = "robot",
+    zenoh_config: ZenohConfig = None,
+    timeout: Timeout = 3.0,
+) -> None:
+    """Show whether the daemon takes work: for whoever restarts it.
+
+    Exit codes: 0 it does, 1 it is starting or stopping, 2 nobody answers in time.
+    """
+    from hmt_service.service.reports import DaemonState
+
+    with connected(connect, site, robot, zenoh_config, timeout_s=timeout) as client:
+        state = client.status().state
+    typer.echo(state)
+    raise typer.Exit(0 if state is DaemonState.RUNNING else NOT_RUNNING)
 
 
 def pose(

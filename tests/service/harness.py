@@ -1,4 +1,4 @@
-"""Factories of the service's tests: real daemons on loopback."""
+"""Factories of the service's tests: real daemons on loopback, and gateways without a map."""
 
 from __future__ import annotations
 
@@ -10,14 +10,30 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from hmt_service.core.config import Preset, SensorConfig
+from hmt_service.core.config import Config, Preset, SensorConfig
 from hmt_service.core.types import Reading
 from hmt_service.io import foxglove
+from hmt_service.runtime.messages import (
+    Finish,
+    Finished,
+    Mapped,
+    ProcessStatus,
+    Request,
+    Result,
+    RunReport,
+)
+from hmt_service.runtime.pipeline import Pipeline
 from hmt_service.service.client import HmtClient
+from hmt_service.service.gateway import Gateway
+from hmt_service.service.intake import IntakeLimits
+from hmt_service.service.keys import Keys
 from hmt_service.service.local import free_endpoint, is_running
+from hmt_service.service.reports import DaemonState
+from hmt_service.service.session import Endpoints, open_session
 from tests.flat import SETTINGS
 
 DEADLINE_S = 20.0
+SAVED = ("map.hmt",)
 
 
 def wait_until(is_true: Callable[[], bool], *, timeout_s: float = DEADLINE_S) -> None:
@@ -111,3 +127,58 @@ def as_received(reading: Reading, sensor: SensorConfig) -> Reading:
     )
     assert isinstance(received, foxglove.Decoded)
     return received.reading
+
+
+class NoMap(Pipeline):
+    """Takes readings and saves nothing: who may ask is settled before the map is."""
+
+    gateway: Gateway
+
+    def __init__(self) -> None:
+        super().__init__(Config())
+        self.shut_downs = 0
+        self.is_loaded = True
+
+    def shut_down(self) -> None:
+        self.shut_downs += 1
+
+    @property
+    def is_ready(self) -> bool:
+        return self.is_loaded
+
+    def status(self) -> tuple[ProcessStatus, ...]:
+        return ()
+
+    def submit(self, _: Reading) -> bool:
+        return True
+
+    def finish(self, finish: Finish) -> bool:
+        finished = Finished(finish.number, SAVED)
+        self.gateway.on_map(Mapped(None, (), RunReport(0, 0.0, 0.0), finished))
+        return True
+
+    def request(self, _: Request, on_result: Callable[[Result], None], *, timeout_s: float) -> None:
+        del timeout_s
+        on_result(SAVED)
+
+
+@contextmanager
+def serving(endpoints: Endpoints, *, robot: str = "robot") -> Iterator[NoMap]:
+    """Serve one robot, without a map."""
+    pipeline = NoMap()
+    with open_session(endpoints) as session:
+        pipeline.gateway = Gateway(
+            session,
+            Keys("site", robot),
+            Config(),
+            pipeline,
+            limits=IntakeLimits(),
+            shut_down=pipeline.shut_down,
+        )
+        pipeline.gateway.open()
+        try:
+            yield pipeline
+        finally:
+            if pipeline.gateway.status().state is not DaemonState.STOPPING:
+                pipeline.gateway.close_input()
+            pipeline.gateway.close()

@@ -16,68 +16,24 @@ import zenoh
 from typer.testing import CliRunner
 
 from hmt_service.cli.app import app
-from hmt_service.core.config import Config
-from hmt_service.core.types import Event, EventKind, Reading
+from hmt_service.core.types import Event, EventKind
 from hmt_service.errors import AccessDenied, Unavailable
-from hmt_service.runtime.messages import (
-    Finish,
-    Finished,
-    Mapped,
-    ProcessStatus,
-    Request,
-    Result,
-    RunReport,
-)
-from hmt_service.runtime.pipeline import Pipeline
 from hmt_service.service.client import HmtClient
-from hmt_service.service.gateway import Gateway
-from hmt_service.service.intake import IntakeLimits
 from hmt_service.service.keys import Input, Keys, Topic
-from hmt_service.service.session import (
-    Endpoints,
-    client_endpoints,
-    daemon_endpoints,
-    open_session,
-)
+from hmt_service.service.session import client_endpoints, daemon_endpoints, open_session
 from tests.flat import readings
-from tests.service.credentials import IMPOSTOR, ROLES, SHIPPED, Credentials, Kind, tls_endpoint
-from tests.service.harness import running_daemon, wait_until
+from tests.service.credentials import (
+    IMPOSTOR,
+    ROLES,
+    SHIPPED,
+    Credentials,
+    Kind,
+    tls_endpoint,
+)
+from tests.service.harness import SAVED, NoMap, running_daemon, serving, wait_until
 
 KEYS = Keys("site", "robot")
 STATUS = "hmt/site/robot/ro/status"
-SAVED = ("map.hmt",)
-
-
-class NoMap(Pipeline):
-    """Takes readings and saves nothing: who may ask is settled before the map is."""
-
-    gateway: Gateway
-
-    def __init__(self) -> None:
-        super().__init__(Config())
-        self.shut_downs = 0
-
-    def shut_down(self) -> None:
-        self.shut_downs += 1
-
-    @property
-    def is_ready(self) -> bool:
-        return True
-
-    def status(self) -> tuple[ProcessStatus, ...]:
-        return ()
-
-    def submit(self, _: Reading) -> bool:
-        return True
-
-    def finish(self, finish: Finish) -> bool:
-        finished = Finished(finish.number, SAVED)
-        self.gateway.on_map(Mapped(None, (), RunReport(0, 0.0, 0.0), finished))
-        return True
-
-    def request(self, _: Request, on_result: Callable[[Result], None], *, timeout_s: float) -> None:
-        del timeout_s
-        on_result(SAVED)
 
 
 @dataclass
@@ -98,7 +54,10 @@ class Guarded:
 
     def session(self, name: str, *, of: str | None = None) -> zenoh.Session:
         config = self.credentials.config(name, of=of)
-        return open_session(client_endpoints(self.endpoint, zenoh_config=config))
+        timeout_s = 3.0 if name == IMPOSTOR else 20.0
+        return open_session(
+            client_endpoints(self.endpoint, timeout_s=timeout_s, zenoh_config=config)
+        )
 
     def received(self) -> int:
         with self.client("operator") as operator:
@@ -106,31 +65,10 @@ class Guarded:
 
 
 @contextmanager
-def serving(endpoints: Endpoints, keys: Keys = KEYS) -> Iterator[NoMap]:
-    """Serve one robot, without a map."""
-    pipeline = NoMap()
-    with open_session(endpoints) as session:
-        pipeline.gateway = Gateway(
-            session,
-            keys,
-            Config(),
-            pipeline,
-            limits=IntakeLimits(),
-            shut_down=pipeline.shut_down,
-        )
-        pipeline.gateway.open()
-        try:
-            yield pipeline
-        finally:
-            pipeline.gateway.close_input()
-            pipeline.gateway.close()
-
-
-@contextmanager
-def guarded_gateway(credentials: Credentials, keys: Keys = KEYS) -> Iterator[Guarded]:
+def guarded_gateway(credentials: Credentials, *, robot: str = "robot") -> Iterator[Guarded]:
     endpoint = tls_endpoint()
     endpoints = daemon_endpoints([endpoint], zenoh_config=credentials.config("daemon"))
-    with serving(endpoints, keys) as server:
+    with serving(endpoints, robot=robot) as server:
         yield Guarded(endpoint, credentials, server)
 
 
@@ -243,7 +181,7 @@ def test_a_robot_may_not_send_to_several(guarded: Guarded, expression: str) -> N
 def test_a_robot_may_not_send_as_another(tmp_path: Path) -> None:
     credentials = Credentials(tmp_path / "etc", Kind.CERTIFICATES)
     reading = readings(1)[0]
-    with guarded_gateway(credentials, Keys("site", "other")) as guarded:
+    with guarded_gateway(credentials, robot="other") as guarded:
         with guarded.client("robot", robot="other") as robot:
             # It sees who listens to the other, and what it says does not reach them.
             robot.publish(reading)
