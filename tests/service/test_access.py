@@ -287,16 +287,20 @@ def test_the_daemon_itself_is_guarded(tmp_path: Path) -> None:
         tmp_path / "out",
         listen=tls_endpoint(),
         zenoh_config=credentials.config("viewer"),
+        is_awaited=False,
         options=["--zenoh-config", str(credentials.config("daemon"))],
     ) as daemon:
+        assert daemon.process.stdout is not None
+        assert "serving" in daemon.process.stdout.readline()
         with daemon.client() as viewer:
             with pytest.raises(AccessDenied):
                 viewer.shut_down()
-            assert viewer.status().state == "running"
+            assert viewer.status().state != "stopping"
         operator = credentials.config("operator")
         with HmtClient(daemon.endpoint, zenoh_config=operator) as client:
             client.shut_down()
         assert "stopped by a client" in daemon.output()
+    assert daemon.process.returncode == 0
 
 
 def test_both_kinds_grant_the_same() -> None:
