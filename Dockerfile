@@ -21,6 +21,7 @@ WORKDIR /data
 VOLUME /data
 
 EXPOSE 7447
-HEALTHCHECK --interval=10s --timeout=5s --start-period=20s CMD ["hmt", "status", "--json"]
+HEALTHCHECK --interval=10s --timeout=5s --start-period=20s CMD ["hmt", "health"]
 ENTRYPOINT ["hmt"]
-CMD ["serve", "--listen", "tcp/0.0.0.0:7447", "--out", "/data/map"]
+# On loopback: run with --network host, or with --listen and --zenoh-config (README, Security).
+CMD ["serve", "--out", "/data/map"]

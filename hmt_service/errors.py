@@ -4,9 +4,11 @@
     +-- InvalidInput      an argument, message or reading that cannot be used
     |   +-- InvalidConfig a configuration that contradicts itself or has unknown keys
     |   +-- InvalidLog    a log file from which nothing can be read
+    |   +-- Unauthenticated an endpoint that would let strangers in
     +-- NotFound          an area, hypothesis or file that does not exist
     +-- Unavailable       the answer does not exist yet, or nobody is there to give it
     |   +-- DeadlineExceeded the answer takes longer than anybody waits for it
+    |   +-- AccessDenied  somebody is there, and does not let these credentials ask
     +-- DaemonFailure     a process of the daemon died or did not start
 
 References: own.
@@ -36,6 +38,10 @@ class InvalidLog(InvalidInput):
     """Nothing can be read from a log file."""
 
 
+class Unauthenticated(InvalidInput):
+    """An endpoint would let others in from other machines without asking who they are."""
+
+
 class NotFound(HmtError):
     """An area, hypothesis or file that was asked for does not exist."""
 
@@ -52,6 +58,10 @@ class DeadlineExceeded(Unavailable):
     """The answer takes longer than anybody waits for it."""
 
     code = "DEADLINE_EXCEEDED"
+
+
+class AccessDenied(Unavailable):
+    """Somebody is there to answer, and does not let these credentials ask."""
 
 
 class DaemonFailure(HmtError):

@@ -9,11 +9,9 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from hmt_service.cli.connection import Connect, Robot, Site
-from hmt_service.service.keys import DEFAULT_ENDPOINT
+from hmt_service.cli.connection import Connect, Robot, Site, ZenohConfig, connected
 
 if TYPE_CHECKING:
-    from hmt_service.client import HmtClient
     from hmt_service.service.reports import Ack
 
 app = typer.Typer(no_args_is_help=True, help="Tell a daemon to finish, to save, to end.")
@@ -21,33 +19,38 @@ app = typer.Typer(no_args_is_help=True, help="Tell a daemon to finish, to save, 
 
 @app.command()
 def finish(
-    connect: Connect = DEFAULT_ENDPOINT, site: Site = "site", robot: Robot = "robot"
+    connect: Connect = None,
+    site: Site = "site",
+    robot: Robot = "robot",
+    zenoh_config: ZenohConfig = None,
 ) -> None:
     """Wait until all input is in the map, and have the map completed and saved."""
-    with _client(connect, site, robot) as client:
+    with connected(connect, site, robot, zenoh_config) as client:
         _print(client.finish())
 
 
 @app.command()
-def save(connect: Connect = DEFAULT_ENDPOINT, site: Site = "site", robot: Robot = "robot") -> None:
+def save(
+    connect: Connect = None,
+    site: Site = "site",
+    robot: Robot = "robot",
+    zenoh_config: ZenohConfig = None,
+) -> None:
     """Have the map saved as it is."""
-    with _client(connect, site, robot) as client:
+    with connected(connect, site, robot, zenoh_config) as client:
         _print(client.save())
 
 
 @app.command()
 def shutdown(
-    connect: Connect = DEFAULT_ENDPOINT, site: Site = "site", robot: Robot = "robot"
+    connect: Connect = None,
+    site: Site = "site",
+    robot: Robot = "robot",
+    zenoh_config: ZenohConfig = None,
 ) -> None:
     """Have the map saved, and the daemon end."""
-    with _client(connect, site, robot) as client:
+    with connected(connect, site, robot, zenoh_config) as client:
         _print(client.shut_down())
-
-
-def _client(connect: str, site: str, robot: str) -> HmtClient:
-    from hmt_service.client import HmtClient
-
-    return HmtClient(connect, site=site, robot=robot)
 
 
 def _print(ack: Ack) -> None:

@@ -1,4 +1,4 @@
-"""`hmt status`, `pose`, `posterior`, `events`, `areas`, `map`, `compare`: ask a daemon.
+"""`hmt status`, `health`, `pose`, `posterior`, `events`, `areas`, `map`, `compare`: ask a daemon.
 
 `posterior` and `events` also read what a run has saved.
 
@@ -14,10 +14,17 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hmt_service.cli.connection import Connect, Json, Robot, Site, Timeout
+from hmt_service.cli.connection import (
+    Connect,
+    Json,
+    Robot,
+    Site,
+    Timeout,
+    ZenohConfig,
+    connected,
+)
 from hmt_service.core.geometry import GaussianPose, yaw_of
 from hmt_service.core.types import EventKind, MapMethod
-from hmt_service.service.keys import DEFAULT_ENDPOINT
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -25,6 +32,9 @@ if TYPE_CHECKING:
     from hmt_service.client import HmtClient
     from hmt_service.core.types import Belief, GlobalMap, Localization
     from hmt_service.service.reports import Status
+
+NOT_RUNNING = 1
+"""Exit code of `hmt health` for a daemon that is there and takes no work."""
 
 Run = Annotated[
     Path | None,
@@ -39,28 +49,49 @@ Hypothesis = Annotated[
 
 
 def status(
-    connect: Connect = DEFAULT_ENDPOINT,
+    connect: Connect = None,
     site: Site = "site",
     robot: Robot = "robot",
+    zenoh_config: ZenohConfig = None,
     timeout: Timeout = 10.0,
     as_json: Json = False,
 ) -> None:
     """Show what the daemon has received, refused and processed."""
-    with _client(connect, site, robot, timeout) as client:
+    with connected(connect, site, robot, zenoh_config, timeout_s=timeout) as client:
         answer = client.status()
     if not _print_json(answer, is_wanted=as_json):
         _print(_pairs(f"{site}/{robot}", _status_rows(answer)))
 
 
-def pose(
-    connect: Connect = DEFAULT_ENDPOINT,
+def health(
+    connect: Connect = None,
     site: Site = "site",
     robot: Robot = "robot",
+    zenoh_config: ZenohConfig = None,
+    timeout: Timeout = 3.0,
+) -> None:
+    """Show whether the daemon takes work: for whoever restarts it.
+
+    Exit codes: 0 it does, 1 it is starting or stopping, 2 nobody answers in time.
+    """
+    from hmt_service.service.reports import DaemonState
+
+    with connected(connect, site, robot, zenoh_config, timeout_s=timeout) as client:
+        state = client.status().state
+    typer.echo(state)
+    raise typer.Exit(0 if state is DaemonState.RUNNING else NOT_RUNNING)
+
+
+def pose(
+    connect: Connect = None,
+    site: Site = "site",
+    robot: Robot = "robot",
+    zenoh_config: ZenohConfig = None,
     timeout: Timeout = 10.0,
     as_json: Json = False,
 ) -> None:
     """Show where the robot is, and how sure that is."""
-    with _client(connect, site, robot, timeout) as client:
+    with connected(connect, site, robot, zenoh_config, timeout_s=timeout) as client:
         answer = client.pose()
     if _print_json(answer, is_wanted=as_json):
         return
@@ -77,9 +108,10 @@ def pose(
 
 def posterior(
     run: Run = None,
-    connect: Connect = DEFAULT_ENDPOINT,
+    connect: Connect = None,
     site: Site = "site",
     robot: Robot = "robot",
+    zenoh_config: ZenohConfig = None,
     timeout: Timeout = 10.0,
     out: Annotated[
         Path | None,
@@ -97,9 +129,10 @@ def posterior(
     Of a saved run (DIR), and with --out: where it was believed to be, over time.
     """
     if run is not None or out is not None:
-        _show_history(_history(run, connect, site, robot, timeout), out, start, end, as_json)
+        beliefs = _history(run, connect, site, robot, zenoh_config, timeout)
+        _show_history(beliefs, out, start, end, as_json)
         return
-    with _client(connect, site, robot, timeout) as client:
+    with connected(connect, site, robot, zenoh_config, timeout_s=timeout) as client:
         answer = client.posterior()
     if _print_json(answer, is_wanted=as_json):
         return
@@ -125,9 +158,10 @@ def posterior(
 
 def events(
     run: Run = None,
-    connect: Connect = DEFAULT_ENDPOINT,
+    connect: Connect = None,
     site: Site = "site",
     robot: Robot = "robot",
+    zenoh_config: ZenohConfig = None,
     timeout: Timeout = 10.0,
     kind: Annotated[
         list[EventKind] | None, typer.Option(help="Only events of this kind; may be repeated.")
@@ -144,7 +178,7 @@ def events(
 
         answer = read_events(run / EVENTS)
     else:
-        with _client(connect, site, robot, timeout) as client:
+        with connected(connect, site, robot, zenoh_config, timeout_s=timeout) as client:
             answer = client.events()
     answer = tuple(event for event in answer if not kind or event.kind in kind)
     if _print_json(answer, is_wanted=as_json):
@@ -162,25 +196,27 @@ def events(
 
 
 def areas(
-    connect: Connect = DEFAULT_ENDPOINT,
+    connect: Connect = None,
     site: Site = "site",
     robot: Robot = "robot",
+    zenoh_config: ZenohConfig = None,
     timeout: Timeout = 10.0,
     reference: Reference = None,
     hypothesis: Hypothesis = None,
     as_json: Json = False,
 ) -> None:
     """Show all areas: where they are, how often they were visited, what they border on."""
-    with _client(connect, site, robot, timeout) as client:
+    with connected(connect, site, robot, zenoh_config, timeout_s=timeout) as client:
         answer = client.areas(reference=reference, hypothesis=hypothesis)
     if not _print_json(answer, is_wanted=as_json):
         _print(_areas_table(answer))
 
 
 def map_(
-    connect: Connect = DEFAULT_ENDPOINT,
+    connect: Connect = None,
     site: Site = "site",
     robot: Robot = "robot",
+    zenoh_config: ZenohConfig = None,
     timeout: Timeout = 10.0,
     method: Annotated[
         MapMethod | None,
@@ -196,7 +232,7 @@ def map_(
     as_json: Json = False,
 ) -> None:
     """Show a global map, as a table or as a figure."""
-    with _client(connect, site, robot, timeout) as client:
+    with connected(connect, site, robot, zenoh_config, timeout_s=timeout) as client:
         if out is not None:
             _draw(client, out, method, reference, hypothesis)
             return
@@ -211,16 +247,17 @@ def map_(
 
 
 def compare(
-    connect: Connect = DEFAULT_ENDPOINT,
+    connect: Connect = None,
     site: Site = "site",
     robot: Robot = "robot",
+    zenoh_config: ZenohConfig = None,
     timeout: Timeout = 10.0,
     reference: Reference = None,
     hypothesis: Hypothesis = None,
     as_json: Json = False,
 ) -> None:
     """Show how far the shortest-path map is from the consistent one, area by area."""
-    with _client(connect, site, robot, timeout) as client:
+    with connected(connect, site, robot, zenoh_config, timeout_s=timeout) as client:
         answer = client.compare(reference=reference, hypothesis=hypothesis)
     if _print_json(answer, is_wanted=as_json):
         return
@@ -255,18 +292,17 @@ def compare(
     )
 
 
-def _client(connect: str, site: str, robot: str, timeout_s: float) -> HmtClient:
-    from hmt_service.client import HmtClient
-
-    return HmtClient(connect, site=site, robot=robot, timeout_s=timeout_s)
-
-
 def _history(
-    run: Path | None, connect: str, site: str, robot: str, timeout_s: float
+    run: Path | None,
+    connect: str | None,
+    site: str,
+    robot: str,
+    zenoh_config: Path | None,
+    timeout_s: float,
 ) -> tuple[Belief, ...]:
     """Return what was believed over time, by a saved run or by a daemon."""
     if run is None:
-        with _client(connect, site, robot, timeout_s) as client:
+        with connected(connect, site, robot, zenoh_config, timeout_s=timeout_s) as client:
             return client.history().beliefs
     from hmt_service.io.audit_files import read_beliefs
     from hmt_service.service.results import BELIEFS

@@ -14,10 +14,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hmt_service.cli.connection import Connect, Robot, Site
+from hmt_service.cli.connection import Connect, Robot, Site, ZenohConfig, connected
 from hmt_service.cli.recorded import print_contents, print_malformed
 from hmt_service.errors import DaemonFailure
-from hmt_service.service.keys import DEFAULT_ENDPOINT
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -33,9 +32,10 @@ _POLL_S = 0.1
 
 def replay(
     log: Annotated[Path, typer.Argument(help="Recorded log: CARMEN or MCAP.")],
-    connect: Connect = DEFAULT_ENDPOINT,
+    connect: Connect = None,
     site: Site = "site",
     robot: Robot = "robot",
+    zenoh_config: ZenohConfig = None,
     rate: Annotated[
         float | None,
         typer.Option(min=1e-3, help="Speed in multiples of real time; without it, full speed."),
@@ -47,11 +47,10 @@ def replay(
     """Send a recorded log to a daemon, and wait for the map."""
     from rich.console import Console
 
-    from hmt_service.client import HmtClient
     from hmt_service.io.logs import read_log
 
     console = Console(stderr=True)
-    with HmtClient(connect, site=site, robot=robot) as client:
+    with connected(connect, site, robot, zenoh_config) as client:
         client.status()
         with console.status(f"reading {log}"):
             recorded = read_log(log, min_range_m=0.0, max_range_m=_FARTHEST_M)

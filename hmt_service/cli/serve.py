@@ -5,7 +5,6 @@ References: own.
 
 from __future__ import annotations
 
-import logging
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -15,7 +14,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hmt_service.cli.connection import Robot, Site
+from hmt_service.cli.connection import Robot, Site, ZenohConfig
+from hmt_service.cli.logs import LogFormat, Say, logging_as
 from hmt_service.cli.settings import (
     BudgetSize,
     ConfigFile,
@@ -30,8 +30,6 @@ from hmt_service.errors import NotFound
 from hmt_service.service.keys import DEFAULT_ENDPOINT, Keys
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from hmt_service.service.daemon import StopReport
 
 PROCESS_FAILED = 3
@@ -45,11 +43,24 @@ def serve(
     robot: Robot = "robot",
     listen: Annotated[
         list[str] | None,
-        typer.Option(help=f"Zenoh endpoint to listen on; {DEFAULT_ENDPOINT} if none is given."),
+        typer.Option(
+            help="Zenoh endpoint to listen on; those of --zenoh-config, or "
+            f"{DEFAULT_ENDPOINT}, if none is given. May be repeated."
+        ),
     ] = None,
     connect: Annotated[
-        list[str] | None, typer.Option(help="Zenoh endpoint to connect to, such as a router's.")
+        list[str] | None,
+        typer.Option(help="Zenoh endpoint to connect to, such as a router's. May be repeated."),
     ] = None,
+    zenoh_config: ZenohConfig = None,
+    allow_unauthenticated: Annotated[
+        bool,
+        typer.Option(
+            "--allow-unauthenticated",
+            help="Let other machines in without asking who they are: to read, to send scans, to "
+            "shut the daemon down.",
+        ),
+    ] = False,
     scouting: Annotated[
         bool, typer.Option("--scouting", help="Look for others on the network by multicast.")
     ] = False,
@@ -82,57 +93,55 @@ def serve(
     ] = None,
     frozen: Frozen = False,
     memory_budget: BudgetSize = None,
+    log_format: Annotated[
+        LogFormat,
+        typer.Option(help="What is logged: lines for people, or one JSON object per line."),
+    ] = LogFormat.TEXT,
 ) -> None:
     """Build the map of one robot from what it sends, and answer questions about it.
 
     Stops within 5 s on SIGINT or SIGTERM, after saving. Exit codes: 0 stopped and saved, 2 wrong
     options or no session, 3 a process died, 4 the map could not be saved.
     """
-    from rich.console import Console
-    from rich.logging import RichHandler
-
     from hmt_service.service.daemon import Daemon, DaemonSettings
     from hmt_service.service.intake import IntakeLimits
     from hmt_service.service.results import save_results
-    from hmt_service.service.session import Endpoints, Mode
+    from hmt_service.service.session import daemon_endpoints
 
-    console = Console(stderr=True)
-    handler = RichHandler(console=console, show_path=False)
-    logging.basicConfig(level=logging.INFO, format="%(message)s", handlers=[handler])
-    kept = kept_map(map_file, is_frozen=frozen, is_known=frozen)
-    settings = settings_of_map(map_file, preset, config)
-    budget = budget_of(memory_budget)
-    if map_file is not None and not map_file.absolute().parent.is_dir():
-        raise NotFound(f"folder {map_file.absolute().parent} of the map file does not exist")
-    listening = listen or ([] if connect else [DEFAULT_ENDPOINT])
-    endpoints = Endpoints(
-        # A router passes nothing between peers that cannot find each other: be its client.
-        mode=Mode.PEER if listening else Mode.CLIENT,
-        listen=tuple(listening),
-        connect=tuple(connect or []),
-        has_scouting=scouting,
-    )
-    save = None
-    if out is not None:
-        save = partial(save_results, directory=out, config=settings, seed=seed, kept=map_file)
-    daemon = Daemon(
-        DaemonSettings(
-            keys=Keys(site, robot),
-            endpoints=endpoints,
-            config=settings,
-            seed=seed,
-            save=save,
-            keeper=kept,
-            budget=budget,
-            limits=IntakeLimits(reorder_s=reorder_window),
-            metrics_port=metrics,
+    with logging_as(log_format) as say:
+        kept = kept_map(map_file, is_frozen=frozen, is_known=frozen)
+        settings = settings_of_map(map_file, preset, config)
+        budget = budget_of(memory_budget)
+        if map_file is not None and not map_file.absolute().parent.is_dir():
+            raise NotFound(f"folder {map_file.absolute().parent} of the map file does not exist")
+        endpoints = daemon_endpoints(
+            listen or (),
+            connect or (),
+            has_scouting=scouting,
+            zenoh_config=zenoh_config,
+            allows_strangers=allow_unauthenticated,
         )
-    )
-    with _signals_to(daemon.request_stop):
-        report = daemon.run(
-            on_open=lambda: console.print(f"serving site {site}, robot {robot} {endpoints}")
+        save = None
+        if out is not None:
+            save = partial(save_results, directory=out, config=settings, seed=seed, kept=map_file)
+        daemon = Daemon(
+            DaemonSettings(
+                keys=Keys(site, robot),
+                endpoints=endpoints,
+                config=settings,
+                seed=seed,
+                save=save,
+                keeper=kept,
+                budget=budget,
+                limits=IntakeLimits(reorder_s=reorder_window),
+                metrics_port=metrics,
+            )
         )
-    _print(console, report)
+        with _signals_to(daemon.request_stop):
+            report = daemon.run(
+                on_open=lambda: say(f"serving site {site}, robot {robot} {endpoints}", False)
+            )
+        _tell(say, report)
     is_saving = save is not None or (map_file is not None and not frozen)
     raise typer.Exit(_exit_code(report, is_saving=is_saving))
 
@@ -151,22 +160,22 @@ def _signals_to(request_stop: Callable[[str], None]) -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def _print(console: Console, report: StopReport) -> None:
+def _tell(say: Say, report: StopReport) -> None:
     counts, finished = report.status.input, report.finished
     refused = ", ".join(f"{count} {reason}" for reason, count in counts.refused.items()) or "none"
-    console.print(
+    say(
         f"stopped by {report.reason}: {counts.received} samples received, refused {refused}; "
         f"{report.status.processed_scans} scans in the map, {report.unprocessed} samples not in it",
-        soft_wrap=True,
+        report.failure is not None,
     )
     if counts.received == 0:
-        console.print("nothing to save")
+        say("nothing to save", False)
     elif finished is None:
-        console.print("[red]the map was not saved: nobody was left to do it in time")
+        say("the map was not saved: nobody was left to do it in time", True)
     elif finished.failure:
-        console.print(f"[red]{finished.failure}")
+        say(finished.failure, True)
     elif finished.files:
-        console.print(f"saved {', '.join(finished.files)}")
+        say(f"saved {', '.join(finished.files)}", False)
 
 
 def _exit_code(report: StopReport, *, is_saving: bool) -> int:

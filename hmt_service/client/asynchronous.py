@@ -10,6 +10,7 @@ import asyncio
 from collections.abc import Callable, Coroutine, Mapping
 from contextlib import suppress
 from functools import wraps
+from pathlib import Path
 from types import TracebackType
 from typing import Any, Concatenate, Generic, ParamSpec, Self, TypeVar
 
@@ -18,7 +19,7 @@ from hmt_service.client.connection import POLL_S, Connection, LoopWatch, Pressur
 from hmt_service.client.feed import Feed
 from hmt_service.core.types import Event, EventKind, HmtPose, OdometryReading, Posterior, Reading
 from hmt_service.errors import DeadlineExceeded, Unavailable
-from hmt_service.service.keys import DEFAULT_ENDPOINT, Input, Keys, Topic
+from hmt_service.service.keys import Input, Keys, Topic
 from hmt_service.service.readings import encode_reading
 
 P = ParamSpec("P")
@@ -129,24 +130,27 @@ class AsyncHmtClient:
 
     def __init__(
         self,
-        endpoint: str = DEFAULT_ENDPOINT,
+        endpoint: str | None = None,
         *,
         site: str = "site",
         robot: str = "robot",
         timeout_s: float = 10.0,
+        zenoh_config: Path | None = None,
     ) -> None:
         """Prepare; `async with` connects.
 
         Args:
-            endpoint: Zenoh endpoint of the daemon, or of a router that reaches it.
+            endpoint: Zenoh endpoint of the daemon, or of a router that reaches it; None for the
+                one that `zenoh_config` names, or `DEFAULT_ENDPOINT`.
             site: Where the robot works.
             robot: Which one it is.
             timeout_s: How long to wait for an answer, wall clock, 600 at most.
+            zenoh_config: File of Zenoh settings: certificates or a password.
 
         Raises:
             InvalidInput: If a name cannot be part of a key.
         """
-        self._endpoint = endpoint
+        self._endpoint, self._zenoh_config = endpoint, zenoh_config
         self._keys = Keys(site, robot)
         self._timeout_s = timeout_s
         self._calls = Calls(self._keys)
@@ -157,10 +161,12 @@ class AsyncHmtClient:
         """Connect, and return the client.
 
         Raises:
-            Unavailable: If nobody listens at the endpoint.
+            InvalidInput: If Zenoh refuses the file.
+            NotFound: If there is no such file.
+            Unavailable: If nobody listens at the endpoint, or does not let this client in.
         """
         self._connection = await asyncio.to_thread(
-            Connection, self._endpoint, self._keys, self._timeout_s
+            Connection, self._endpoint, self._keys, self._timeout_s, self._zenoh_config
         )
         return self
 
@@ -274,7 +280,7 @@ class AsyncHmtClient:
 
         Raises:
             InvalidInput: If the stamp is not finite.
-            Unavailable: If nobody takes it.
+            Unavailable: If nobody takes it, or not from this client.
         """
         message = encode_reading(reading)
         if self._pressure.is_due(len(message.payload)):

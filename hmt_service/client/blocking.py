@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from functools import wraps
+from pathlib import Path
 from types import TracebackType
 from typing import Concatenate, Generic, ParamSpec, Self, TypeVar
 
@@ -17,7 +18,7 @@ from hmt_service.client.connection import POLL_S, Connection, LoopWatch, Pressur
 from hmt_service.client.feed import Feed
 from hmt_service.core.types import Event, EventKind, HmtPose, OdometryReading, Posterior, Reading
 from hmt_service.errors import DeadlineExceeded, Unavailable
-from hmt_service.service.keys import DEFAULT_ENDPOINT, Input, Keys, Topic
+from hmt_service.service.keys import Input, Keys, Topic
 from hmt_service.service.readings import encode_reading
 
 P = ParamSpec("P")
@@ -119,27 +120,31 @@ class HmtClient:
 
     def __init__(
         self,
-        endpoint: str = DEFAULT_ENDPOINT,
+        endpoint: str | None = None,
         *,
         site: str = "site",
         robot: str = "robot",
         timeout_s: float = 10.0,
+        zenoh_config: Path | None = None,
     ) -> None:
         """Connect.
 
         Args:
-            endpoint: Zenoh endpoint of the daemon, or of a router that reaches it.
+            endpoint: Zenoh endpoint of the daemon, or of a router that reaches it; None for the
+                one that `zenoh_config` names, or `DEFAULT_ENDPOINT`.
             site: Where the robot works.
             robot: Which one it is.
             timeout_s: How long to wait for an answer, wall clock, 600 at most.
+            zenoh_config: File of Zenoh settings: certificates or a password.
 
         Raises:
-            InvalidInput: If a name cannot be part of a key.
-            Unavailable: If nobody listens at the endpoint.
+            InvalidInput: If a name cannot be part of a key, or Zenoh refuses the file.
+            NotFound: If there is no such file.
+            Unavailable: If nobody listens at the endpoint, or does not let this client in.
         """
         keys = Keys(site, robot)
         self._calls = Calls(keys)
-        self._connection = Connection(endpoint, keys, timeout_s)
+        self._connection = Connection(endpoint, keys, timeout_s, zenoh_config)
         self._pressure = Pressure()
 
     def close(self) -> None:
@@ -256,7 +261,7 @@ class HmtClient:
 
         Raises:
             InvalidInput: If the stamp is not finite.
-            Unavailable: If nobody takes it.
+            Unavailable: If nobody takes it, or not from this client.
         """
         message = encode_reading(reading)
         if self._pressure.is_due(len(message.payload)):
@@ -283,6 +288,6 @@ class HmtClient:
             encoding: Its name, such as `application/protobuf;foxglove.LaserScan`.
 
         Raises:
-            Unavailable: If nobody takes it.
+            Unavailable: If nobody takes it, or not from this client.
         """
         self._connection.put(name, payload, encoding)

@@ -12,6 +12,7 @@ import secrets
 import threading
 from collections.abc import Mapping
 from concurrent.futures import Future
+from pathlib import Path
 from typing import Generic, TypeVar, cast
 
 import zenoh
@@ -19,12 +20,12 @@ import zenoh
 from hmt_service.client.calls import Ask
 from hmt_service.client.feed import Feed
 from hmt_service.core.types import Posterior
-from hmt_service.errors import DeadlineExceeded, HmtError, InvalidInput, Unavailable
+from hmt_service.errors import AccessDenied, DeadlineExceeded, HmtError, InvalidInput, Unavailable
 from hmt_service.service.codec import PREFIX, decode, decode_place, encode_origin
 from hmt_service.service.keys import Input, Keys, Topic
 from hmt_service.service.questions import DEADLINE, PART_BYTES
 from hmt_service.service.reports import Status
-from hmt_service.service.session import Endpoints, Mode, open_session
+from hmt_service.service.session import client_endpoints, open_session
 
 T = TypeVar("T")
 
@@ -41,23 +42,36 @@ POLL_S = 0.1
 class Connection:
     """One session with the daemon of one robot; may be used from any thread."""
 
-    def __init__(self, endpoint: str, keys: Keys, timeout_s: float) -> None:
+    def __init__(
+        self, endpoint: str | None, keys: Keys, timeout_s: float, zenoh_config: Path | None
+    ) -> None:
         """Connect.
 
         Args:
-            endpoint: Zenoh endpoint of the daemon, or of a router that reaches it.
+            endpoint: Zenoh endpoint of the daemon, or of a router that reaches it; None for the
+                one that `zenoh_config` names, or `DEFAULT_ENDPOINT`.
             keys: Names of the robot.
             timeout_s: How long to wait for answers, wall clock.
+            zenoh_config: File of Zenoh settings: certificates or a password.
 
         Raises:
-            Unavailable: If nobody listens at the endpoint.
+            InvalidInput: If Zenoh refuses the file.
+            NotFound: If there is no such file.
+            Unavailable: If nobody listens at the endpoint, or does not let this client in.
         """
-        self.endpoint = endpoint
+        waiting_s = min(_MOST_CONNECTING_S, timeout_s)
+        endpoints = client_endpoints(endpoint, timeout_s=waiting_s, zenoh_config=zenoh_config)
+        self.endpoint = ", ".join(endpoints.connect)
         self.keys = keys
         self.timeout_s = timeout_s
-        waiting_s = min(_MOST_CONNECTING_S, timeout_s)
-        endpoints = Endpoints(mode=Mode.CLIENT, connect=(endpoint,), timeout_s=waiting_s)
         self._session = open_session(endpoints)
+        # Asked now: a question that is not answered ends where nobody may wait for another answer.
+        liveliness = self._session.liveliness()
+        tokens = liveliness.get(keys.liveliness, timeout=waiting_s)
+        self._is_served = any(reply.ok is not None for reply in tokens)
+        self._liveliness = liveliness.declare_subscriber(
+            keys.liveliness, zenoh.handlers.Callback(self._on_liveliness)
+        )
         self._publishers: dict[Input, zenoh.Publisher] = {}
         self._sender = 1 + secrets.randbelow(2**64 - 1)
         self._sent = dict.fromkeys(Input, 0)
@@ -151,11 +165,14 @@ class Connection:
             subscriber.undeclare()
 
     def nobody(self, key: str) -> Unavailable:
-        """Return the error that nobody is there."""
-        return Unavailable(
-            f"nobody answers {key} at {self.endpoint}: no daemon of site {self.keys.site}, "
-            f"robot {self.keys.robot}"
-        )
+        """Return the error that nobody is there, or not for this client."""
+        name = f"daemon of site {self.keys.site}, robot {self.keys.robot}"
+        if self._is_served:
+            return AccessDenied(f"the {name} is at {self.endpoint}, and {key} is not granted here")
+        return Unavailable(f"nobody answers {key} at {self.endpoint}: no {name}")
+
+    def _on_liveliness(self, sample: zenoh.Sample) -> None:
+        self._is_served = sample.kind == zenoh.SampleKind.PUT
 
     def _keep(self, feed: Feed[T], subscriber: zenoh.Subscriber[None]) -> Feed[T]:
         with self._lock:

@@ -5,12 +5,14 @@ References: own.
 
 from __future__ import annotations
 
+import os
 import socket
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import IO
 
 from hmt_service.client.blocking import HmtClient
@@ -29,10 +31,15 @@ def free_endpoint() -> str:
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
-def is_running(endpoint: str) -> bool:
-    """Return whether a daemon there takes work: one that listens may still load its libraries."""
+def is_running(endpoint: str, zenoh_config: Path | None = None) -> bool:
+    """Return whether a daemon there takes work: one that listens may still load its libraries.
+
+    Args:
+        endpoint: Where it listens.
+        zenoh_config: File of Zenoh settings to be let in with.
+    """
     try:
-        with HmtClient(endpoint) as client:
+        with HmtClient(endpoint, zenoh_config=zenoh_config) as client:
             return client.status().state is DaemonState.RUNNING
     except Unavailable:
         return False
@@ -54,8 +61,10 @@ def local_daemon(*options: str, output: IO[str] | None = None) -> Iterator[str]:
         DaemonFailure: If it ends or is not ready in time.
     """
     endpoint = free_endpoint()
+    # What the caller's shell says about another daemon (HMT_SITE, HMT_ZENOH_CONFIG) is not for it.
+    environment = {name: text for name, text in os.environ.items() if not name.startswith("HMT_")}
     command = [sys.executable, "-m", "hmt_service", "serve", "--listen", endpoint, *options]
-    with subprocess.Popen(command, stdout=output, stderr=output) as process:
+    with subprocess.Popen(command, stdout=output, stderr=output, env=environment) as process:
         try:
             deadline_s = time.monotonic() + _START_S
             while not is_running(endpoint):

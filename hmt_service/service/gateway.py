@@ -188,7 +188,7 @@ class Gateway:
         """Keep, log and publish events."""
         for event in events:
             level = logging.WARNING if event.kind in _WARNINGS else logging.INFO
-            _LOG.log(level, "%s: %s", event.kind, event.message)
+            _LOG.log(level, "%s: %s", event.kind, event.message, extra={"event": event})
             self._audit.note([event])
             self._put(Topic.EVENT, event)
 

@@ -1,4 +1,4 @@
-"""Factories of the service's tests: real daemons on loopback."""
+"""Factories of the service's tests: real daemons on loopback, and gateways without a map."""
 
 from __future__ import annotations
 
@@ -12,12 +12,29 @@ from pathlib import Path
 
 from hmt_service.client import HmtClient
 from hmt_service.client.local import free_endpoint, is_running
-from hmt_service.core.config import Preset, SensorConfig
+from hmt_service.core.config import Config, Preset, SensorConfig
 from hmt_service.core.types import Reading
 from hmt_service.io import foxglove
+from hmt_service.runtime.messages import (
+    Finish,
+    Finished,
+    Mapped,
+    ProcessStatus,
+    Request,
+    Result,
+    RunReport,
+)
+from hmt_service.runtime.pipeline import Pipeline
+from hmt_service.service.codec import encode
+from hmt_service.service.gateway import Gateway
+from hmt_service.service.intake import IntakeLimits
+from hmt_service.service.keys import Keys
+from hmt_service.service.reports import DaemonState
+from hmt_service.service.session import Endpoints, open_session
 from tests.flat import SETTINGS
 
 DEADLINE_S = 20.0
+SAVED = ("map.hmt",)
 
 
 def wait_until(is_true: Callable[[], bool], *, timeout_s: float = DEADLINE_S) -> None:
@@ -35,9 +52,11 @@ class RunningDaemon:
     endpoint: str
     out: Path
     process: subprocess.Popen[str]
+    zenoh_config: Path | None = None
+    """What its clients are let in with."""
 
     def client(self) -> HmtClient:
-        return HmtClient(self.endpoint)
+        return HmtClient(self.endpoint, zenoh_config=self.zenoh_config)
 
     def output(self) -> str:
         """Wait for the end and return what was printed."""
@@ -50,6 +69,8 @@ def running_daemon(
     out: Path,
     *,
     router: str | None = None,
+    listen: str | None = None,
+    zenoh_config: Path | None = None,
     is_awaited: bool = True,
     preset: Preset = Preset.PLANAR,
     map_file: Path | None = None,
@@ -60,12 +81,14 @@ def running_daemon(
     Args:
         out: Folder to save to.
         router: Endpoint of a router to reach it through, instead of its own.
+        listen: Its own endpoint; a free one on loopback if not given.
+        zenoh_config: What its clients are let in with.
         is_awaited: Whether it shall be ready for work.
         preset: Kind of sensor that it expects.
         map_file: Map file to go on with.
         options: More of `hmt serve`.
     """
-    endpoint = router or free_endpoint()
+    endpoint = router or listen or free_endpoint()
     settings = out.parent / "settings.yaml"
     settings.write_text(SETTINGS)
     command = [sys.executable, "-m", "hmt_service", "serve", "--out", str(out), *options]
@@ -80,7 +103,7 @@ def running_daemon(
         stderr=subprocess.STDOUT,
         text=True,
     ) as process:
-        daemon = RunningDaemon(endpoint, out, process)
+        daemon = RunningDaemon(endpoint, out, process, zenoh_config)
         try:
             if is_awaited:
                 wait_until(lambda: _is_running(daemon))
@@ -91,7 +114,7 @@ def running_daemon(
 
 def _is_running(daemon: RunningDaemon) -> bool:
     assert daemon.process.poll() is None, daemon.output()
-    return is_running(daemon.endpoint)
+    return is_running(daemon.endpoint, daemon.zenoh_config)
 
 
 def as_received(reading: Reading, sensor: SensorConfig) -> Reading:
@@ -105,3 +128,65 @@ def as_received(reading: Reading, sensor: SensorConfig) -> Reading:
     )
     assert isinstance(received, foxglove.Decoded)
     return received.reading
+
+
+class NoMap(Pipeline):
+    """Takes readings and saves nothing: who may ask is settled before the map is."""
+
+    gateway: Gateway
+
+    def __init__(self) -> None:
+        super().__init__(Config(), encode=encode)
+        self.shut_downs = 0
+        self.is_loaded = True
+
+    def shut_down(self) -> None:
+        self.shut_downs += 1
+
+    @property
+    def is_ready(self) -> bool:
+        return self.is_loaded
+
+    def status(self) -> tuple[ProcessStatus, ...]:
+        return ()
+
+    def submit(self, _: Reading) -> bool:
+        return True
+
+    def finish(self, finish: Finish) -> bool:
+        finished = Finished(finish.number, SAVED)
+        self.gateway.on_map(Mapped(None, (), RunReport(0, 0.0, 0.0), finished))
+        return True
+
+    def request(
+        self,
+        _: Request,
+        on_result: Callable[[Result], None],
+        *,
+        timeout_s: float,
+        part_bytes: int | None = None,
+    ) -> None:
+        del timeout_s, part_bytes
+        on_result(SAVED)
+
+
+@contextmanager
+def serving(endpoints: Endpoints, *, robot: str = "robot") -> Iterator[NoMap]:
+    """Serve one robot, without a map."""
+    pipeline = NoMap()
+    with open_session(endpoints) as session:
+        pipeline.gateway = Gateway(
+            session,
+            Keys("site", robot),
+            Config(),
+            pipeline,
+            limits=IntakeLimits(),
+            shut_down=pipeline.shut_down,
+        )
+        pipeline.gateway.open()
+        try:
+            yield pipeline
+        finally:
+            if pipeline.gateway.status().state is not DaemonState.STOPPING:
+                pipeline.gateway.close_input()
+            pipeline.gateway.close()
