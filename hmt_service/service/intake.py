@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from hmt_service.core.config import SensorConfig
 from hmt_service.core.ordering import ReorderWindow
 from hmt_service.core.types import Reading
-from hmt_service.io.foxglove import Decoded, Defect
+from hmt_service.io.decoding import Decoded, Defect
 from hmt_service.runtime.messages import Finish
 from hmt_service.runtime.queues import SizedQueue
 from hmt_service.service.keys import Input

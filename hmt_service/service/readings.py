@@ -11,7 +11,7 @@ from enum import StrEnum
 from hmt_service.core.config import SensorConfig
 from hmt_service.core.types import Reading
 from hmt_service.io import foxglove
-from hmt_service.io.foxglove import Decoded, Defect
+from hmt_service.io.decoding import Decoded, Defect
 from hmt_service.service.codec import PREFIX, Wire, wire
 from hmt_service.service.keys import Input
 

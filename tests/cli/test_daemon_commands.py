@@ -18,7 +18,7 @@ from hmt_service.core.engine import Engine
 from hmt_service.core.odometry import Odometry
 from hmt_service.errors import NotFound, Unavailable
 from hmt_service.io.logs import read_log
-from hmt_service.io.mcap_log import McapWriter
+from hmt_service.io.mcap_writer import McapWriter
 from hmt_service.io.trajectory import read_tum
 from hmt_service.service.client import HmtClient
 from hmt_service.service.local import free_endpoint

@@ -13,6 +13,7 @@ from pathlib import Path
 from hmt_service.core.config import Preset, SensorConfig
 from hmt_service.core.types import Reading
 from hmt_service.io import foxglove
+from hmt_service.io.decoding import Decoded
 from hmt_service.service.client import HmtClient
 from hmt_service.service.local import free_endpoint, is_running
 from tests.flat import SETTINGS
@@ -103,5 +104,5 @@ def as_received(reading: Reading, sensor: SensorConfig) -> Reading:
         min_range_m=sensor.min_range_m,
         max_range_m=sensor.max_range_m,
     )
-    assert isinstance(received, foxglove.Decoded)
+    assert isinstance(received, Decoded)
     return received.reading

@@ -7,7 +7,7 @@ from foxglove_schemas_protobuf.LaserScan_pb2 import LaserScan
 from hmt_service.core.config import SensorConfig
 from hmt_service.core.geometry import planar_pose
 from hmt_service.core.types import OdometryReading, Reading, Scan
-from hmt_service.io.foxglove import Decoded, Defect
+from hmt_service.io.decoding import Decoded, Defect
 from hmt_service.service.codec import encoding_of
 from hmt_service.service.keys import Input
 from hmt_service.service.readings import Refusal, decode_reading, encode_reading
