@@ -176,7 +176,7 @@ def read_topics(
         InvalidLog: If the log cannot be opened or holds no usable scan.
         InvalidInput: If a pose is given, and the scans have one of their own.
     """
-    counts = file.topics()
+    counts = Counter({t: count for t, count in file.topics().items() if _is_known(t)})
     scan = _busiest(counts, _SCANS)
     odometry = _busiest(counts, _BEST_ODOMETRY) or _busiest(counts, _ODOMETRY)
     any_frame = _Rules(min_range_m, max_range_m, Frames())
@@ -200,6 +200,11 @@ def read_topics(
             if topic.schema in _SCANS | _ODOMETRY and topic not in topics
         ),
     )
+
+
+def _is_known(topic: Topic) -> bool:
+    """Return whether its messages are encoded as they are by who defined them."""
+    return topic.schema.startswith("foxglove.") == (topic.encoding == PROTOBUF)
 
 
 def _busiest(counts: Counter[Topic], schemas: Collection[str]) -> Topic | None:

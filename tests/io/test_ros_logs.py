@@ -236,6 +236,36 @@ def test_a_log_without_a_usable_scan_is_refused_with_numbers(
         read(write(tmp_path, sent))
 
 
+@pytest.mark.parametrize(
+    ("schema", "encoding"),
+    [
+        (LASER, "protobuf"),
+        (LASER, "json"),
+        ("foxglove.LaserScan", "cdr"),
+        ("tf2_msgs/msg/TFMessage", "protobuf"),
+    ],
+)
+def test_messages_encoded_by_somebody_else_are_passed_over(
+    tmp_path: Path, schema: str, encoding: str
+) -> None:
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        strange = writer.register_channel(
+            "/tf_static", encoding, writer.register_schema(schema, "", b"")
+        )
+        scans = writer.register_channel("/scan", "cdr", writer.register_schema(LASER, "", b""))
+        for time in range(1, 4):
+            for _ in range(3):
+                writer.add_message(strange, time, b"\xff", time)
+            payload = ROS2.serialize(ROS2.laser_scan([1.0, 2.0], stamp_s=float(time)))
+            writer.add_message(scans, time, payload, time)
+        writer.finish()
+    log = read(path)
+    assert (log.scans, log.unread, len(list(log.readings)), log.malformed) == (3, (), 3, ())
+
+
 def test_a_pose_is_for_ros_only(tmp_path: Path) -> None:
     path = tmp_path / "a.log"
     path.write_text("FLASER 2 1 1 0 0 0 0 0 0 1 host 1\n")
