@@ -8,7 +8,7 @@ import typer.main
 
 from hmt_service.cli.app import app
 from hmt_service.core.config import Config, Preset
-from hmt_service.io.foxglove import Defect
+from hmt_service.io.decoding import Defect
 from hmt_service.service.keys import Call, Control, Input, Topic
 from hmt_service.service.readings import Refusal
 

@@ -16,6 +16,7 @@ import typer
 
 from hmt_service.cli.connection import Connect, Robot, Site, ZenohConfig, connected
 from hmt_service.cli.recorded import print_contents, print_malformed
+from hmt_service.cli.settings import SensorPose, pose_on_body
 from hmt_service.errors import DaemonFailure
 
 if TYPE_CHECKING:
@@ -31,7 +32,7 @@ _POLL_S = 0.1
 
 
 def replay(
-    log: Annotated[Path, typer.Argument(help="Recorded log: CARMEN or MCAP.")],
+    log: Annotated[Path, typer.Argument(help="Recorded log: CARMEN, MCAP or ROS.")],
     connect: Connect = None,
     site: Site = "site",
     robot: Robot = "robot",
@@ -40,6 +41,7 @@ def replay(
         float | None,
         typer.Option(min=1e-3, help="Speed in multiples of real time; without it, full speed."),
     ] = None,
+    sensor_pose: SensorPose = None,
     finish: Annotated[
         bool, typer.Option(help="Wait until all is in the map, and have it completed and saved.")
     ] = True,
@@ -53,7 +55,12 @@ def replay(
     with connected(connect, site, robot, zenoh_config) as client:
         client.status()
         with console.status(f"reading {log}"):
-            recorded = read_log(log, min_range_m=0.0, max_range_m=_FARTHEST_M)
+            recorded = read_log(
+                log,
+                min_range_m=0.0,
+                max_range_m=_FARTHEST_M,
+                body_from_sensor=pose_on_body(sensor_pose),
+            )
         print_contents(console, recorded)
         replay_readings(
             client,

@@ -17,8 +17,10 @@ from hmt_service.cli.settings import (
     Frozen,
     OwnPreset,
     Seed,
+    SensorPose,
     budget_of,
     kept_map,
+    pose_on_body,
     settings_of_map,
 )
 
@@ -34,11 +36,12 @@ if TYPE_CHECKING:
 
 
 def run(
-    log: Annotated[Path, typer.Argument(help="Recorded log: CARMEN or MCAP.")],
+    log: Annotated[Path, typer.Argument(help="Recorded log: CARMEN, MCAP or ROS.")],
     out: Annotated[Path, typer.Option(help="Folder to write trajectory, map and summary to.")],
     preset: OwnPreset = None,
     config: ConfigFile = None,
     seed: Seed = 0,
+    sensor_pose: SensorPose = None,
     map_file: Annotated[
         Path | None,
         typer.Option(
@@ -64,6 +67,7 @@ def run(
             log,
             min_range_m=settings.sensor.min_range_m,
             max_range_m=settings.sensor.max_range_m,
+            body_from_sensor=pose_on_body(sensor_pose),
         )
     print_contents(console, recorded)
     begin = Engine if kept is None else kept.engine

@@ -22,8 +22,10 @@ from hmt_service.cli.settings import (
     Frozen,
     OwnPreset,
     Seed,
+    SensorPose,
     budget_of,
     kept_map,
+    pose_on_body,
     settings_of_map,
 )
 from hmt_service.errors import NotFound
@@ -67,6 +69,24 @@ def serve(
     preset: OwnPreset = None,
     config: ConfigFile = None,
     seed: Seed = 0,
+    ros2_laser: Annotated[
+        str | None,
+        typer.Option(
+            metavar="TOPIC",
+            help="Topic of ROS 2, such as /scan, to take LaserScan messages from, as rmw_zenoh or "
+            "zenoh-bridge-ros2dds publishes them.",
+        ),
+    ] = None,
+    ros2_cloud: Annotated[
+        str | None, typer.Option(metavar="TOPIC", help="The same for PointCloud2.")
+    ] = None,
+    ros2_odometry: Annotated[
+        str | None, typer.Option(metavar="TOPIC", help="The same for Odometry, such as /odom.")
+    ] = None,
+    ros2_domain: Annotated[
+        int, typer.Option(envvar="ROS_DOMAIN_ID", help="Domain of the robot, for rmw_zenoh.")
+    ] = 0,
+    sensor_pose: SensorPose = None,
     reorder_window: Annotated[
         float,
         typer.Option(
@@ -103,9 +123,11 @@ def serve(
     Stops within 5 s on SIGINT or SIGTERM, after saving. Exit codes: 0 stopped and saved, 2 wrong
     options or no session, 3 a process died, 4 the map could not be saved.
     """
+    from hmt_service.io.ros_messages import RosType
     from hmt_service.service.daemon import Daemon, DaemonSettings
     from hmt_service.service.intake import IntakeLimits
     from hmt_service.service.results import save_results
+    from hmt_service.service.ros2 import Ros2Input
     from hmt_service.service.session import daemon_endpoints
 
     with logging_as(log_format) as say:
@@ -114,6 +136,16 @@ def serve(
         budget = budget_of(memory_budget)
         if map_file is not None and not map_file.absolute().parent.is_dir():
             raise NotFound(f"folder {map_file.absolute().parent} of the map file does not exist")
+        topics = {
+            RosType.LASER_SCAN: ros2_laser,
+            RosType.POINT_CLOUD: ros2_cloud,
+            RosType.ODOMETRY: ros2_odometry,
+        }
+        ros2 = Ros2Input(
+            topics={kind: topic for kind, topic in topics.items() if topic is not None},
+            domain=ros2_domain,
+            body_from_sensor=pose_on_body(sensor_pose),
+        )
         endpoints = daemon_endpoints(
             listen or (),
             connect or (),
@@ -129,6 +161,7 @@ def serve(
                 keys=Keys(site, robot),
                 endpoints=endpoints,
                 config=settings,
+                ros2=ros2,
                 seed=seed,
                 save=save,
                 keeper=kept,

@@ -15,6 +15,7 @@ from hmt_service.core.config import Config, Preset, load_config
 from hmt_service.errors import InvalidInput, NotFound
 
 if TYPE_CHECKING:
+    from hmt_service.core.geometry import Pose
     from hmt_service.core.visits import MemoryBudget
     from hmt_service.service.kept_map import KeptMap
 
@@ -46,6 +47,15 @@ BudgetSize = Annotated[
         "are in memory if none is given.",
     ),
 ]
+SensorPose = Annotated[
+    tuple[float, float, float, float, float, float] | None,
+    typer.Option(
+        "--sensor-pose",
+        metavar="X Y Z ROLL PITCH YAW",
+        help="Pose of the sensor on the body, m and degrees, for scans of ROS. Without it a log's "
+        "`tf_static` says it; where nothing does, only odometry of the scans' own frame is taken.",
+    ),
+]
 _UNITS = {"KB": 1e3, "MB": 1e6, "GB": 1e9}
 
 
@@ -64,6 +74,30 @@ def budget_of(size: str | None) -> MemoryBudget | None:
     if found is None:
         raise InvalidInput(f"{size!r} is no size of memory: a number with kB, MB or GB, as 256MB")
     return MemoryBudget(int(float(found[1]) * _UNITS[found[2]]), DiskShelf())
+
+
+def pose_on_body(numbers: tuple[float, float, float, float, float, float] | None) -> Pose | None:
+    """Return `body_from_sensor` of `SensorPose`, None for none.
+
+    Raises:
+        InvalidInput: If a number is not finite.
+    """
+    if numbers is None:
+        return None
+    import numpy as np
+
+    from hmt_service.core.geometry import exp, identity
+
+    if not np.all(np.isfinite(numbers)):
+        raise InvalidInput(f"pose of the sensor {numbers} is not finite")
+    x, y, z, *angles_deg = numbers
+    roll, pitch, yaw = np.radians(angles_deg)
+    pose = identity()
+    # About fixed axes (REP 103).
+    for turn in ([0.0, 0.0, yaw], [0.0, pitch, 0.0], [roll, 0.0, 0.0]):
+        pose = pose @ exp(np.array([*turn, 0.0, 0.0, 0.0]))
+    pose[:3, 3] = x, y, z
+    return pose
 
 
 def settings_of_map(map_file: Path | None, preset: Preset | None, config: Path | None) -> Config:

@@ -13,10 +13,8 @@ References:
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field
-from enum import StrEnum
-from types import MappingProxyType
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -32,32 +30,30 @@ from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
 from google.protobuf.message import DecodeError, Message
 from google.protobuf.timestamp_pb2 import Timestamp
 
-from hmt_service.core.geometry import (
-    FloatArray,
-    Pose,
-    identity,
-    pose_of,
-    quaternion_of,
-    transform_points,
-)
+from hmt_service.core.geometry import Pose, identity, quaternion_of, transform_points
 from hmt_service.core.types import OdometryReading, Reading, Scan
 from hmt_service.errors import InvalidInput
+from hmt_service.io.decoding import (
+    BODY_FRAMES,
+    MAX_SENSOR_OFFSET_M,
+    NANOSECONDS,
+    Decoded,
+    Defect,
+    DefectError,
+    Returns,
+    check_angles,
+    check_frame,
+    checked_pose,
+    odometry_reading,
+    planar_scan,
+    ranges_of,
+    stamp_of,
+    wrong_beams,
+)
 
-BODY_FRAMES = frozenset({"body", "base_link"})
-"""Names of the body frame: ours and ROS's."""
 ODOMETRY_FRAME = "odom"
 """Name of the frame that odometry drifts in."""
 _SWEEP_SHARE = "sweep_share"
-_NANOSECONDS = 10**9
-_MAX_WRONG_SHARE = 0.5
-# A range written with centimetres and rebuilt from coordinates must not fall off the end of the
-# sensor.
-_RANGE_TOLERANCE_M = 1e-6
-# Farther than any sensor from its robot, and any robot from its start: beyond it numbers lose their
-# meaning.
-_MAX_SENSOR_OFFSET_M = 1e3
-_MAX_ODOMETRY_M = 1e7
-_FULL_TURN_RAD = 2.0 * np.pi + 1e-6
 _TYPES: dict[int, str] = {
     PackedElementField.UINT8: "u1",
     PackedElementField.INT8: "i1",
@@ -71,57 +67,12 @@ _TYPES: dict[int, str] = {
 _FLOATS = {4: PackedElementField.FLOAT32, 8: PackedElementField.FLOAT64}
 
 
-class Defect(StrEnum):
-    """Why a message is no reading, or a reading does not fit those before it."""
-
-    NOT_PROTOBUF = "not_protobuf"
-    WRONG_FRAME = "wrong_frame"
-    BAD_STAMP = "bad_stamp"
-    BAD_POSE = "bad_pose"
-    BAD_GEOMETRY = "bad_geometry"
-    EMPTY = "empty"
-    NAN_RANGES = "nan_ranges"
-    NEGATIVE_RANGES = "negative_ranges"
-    TIME_BACKWARDS = "time_backwards"
-    TIME_JUMPED = "time_jumped"
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Decoded:
-    """A reading that passed every check that needs no other reading."""
-
-    reading: Reading
-    """What the robot said."""
-    body_frame: str | None = None
-    """What the message calls the body; None where it does not say."""
-    dropped_beams: Mapping[Defect, int] = field(default_factory=lambda: MappingProxyType({}))
-    """Beams that are left out of it because they are wrong; those without a return are not."""
-
-
 @dataclass(frozen=True, slots=True)
 class _Rules:
     """What the messages of one sender are held to."""
 
-    min_range_m: float
-    max_range_m: float
+    returns: Returns
     body_frames: Collection[str] | None
-
-    def check_body(self, frame: str) -> None:
-        if self.body_frames is not None and frame not in self.body_frames:
-            raise _DefectError(Defect.WRONG_FRAME)
-
-    def is_return(self, ranges: FloatArray) -> npt.NDArray[np.bool_]:
-        nearest = self.min_range_m - _RANGE_TOLERANCE_M
-        farthest = self.max_range_m + _RANGE_TOLERANCE_M
-        return (ranges >= nearest) & (ranges <= farthest)
-
-
-class _DefectError(Exception):
-    """Carries a defect out of the checks below; never leaves this module."""
-
-    def __init__(self, defect: Defect) -> None:
-        super().__init__(defect)
-        self.defect = defect
 
 
 def decode(
@@ -143,10 +94,13 @@ def decode(
     """
     message_type, read = _READERS[schema]
     try:
-        return read(message_type.FromString(payload), _Rules(min_range_m, max_range_m, body_frames))
+        return read(
+            message_type.FromString(payload),
+            _Rules(Returns(min_range_m, max_range_m), body_frames),
+        )
     except DecodeError:
         return Defect.NOT_PROTOBUF
-    except _DefectError as error:
+    except DefectError as error:
         return error.defect
 
 
@@ -223,17 +177,12 @@ def _laser_scan(message: LaserScan, rules: _Rules) -> Decoded:
     stamp_s = _stamp(message)
     body_from_sensor = _body_from_sensor(message, rules)
     ranges = np.array(message.ranges)
-    dropped = _wrong_beams(ranges)
+    dropped = wrong_beams(ranges)
     span = message.end_angle - message.start_angle
-    # NaN fails every comparison, and with it the check.
-    if not (abs(span) <= _FULL_TURN_RAD and abs(message.start_angle) <= 2.0 * _FULL_TURN_RAD):
-        raise _DefectError(Defect.BAD_GEOMETRY)
+    check_angles(message.start_angle, span)
     angles = message.start_angle + span * np.arange(len(ranges)) / max(1, len(ranges) - 1)
-    has_return = rules.is_return(ranges)
-    directions = np.stack([np.cos(angles), np.sin(angles), np.zeros(len(angles))], axis=1)
-    points = ranges[has_return, None] * directions[has_return]
-    points_in_body = transform_points(body_from_sensor, points)
-    scan = Scan(stamp_s, points_in_body, body_from_sensor[:3, 3])
+    has_return = rules.returns.among(ranges)
+    scan = planar_scan(stamp_s, ranges, angles, has_return, body_from_sensor)
     return Decoded(scan, message.frame_id, dropped)
 
 
@@ -247,25 +196,20 @@ def _point_cloud(message: PointCloud, rules: _Rules) -> Decoded:
         for axis, name in enumerate("xyz"):
             if name in _names(rows):
                 points[:, axis] = rows[name]
-        ranges = np.linalg.norm(points, axis=1)
-    # Organised clouds mark directions without a return by NaN: only a cloud of nothing else is
-    # wrong.
-    undefined = int(np.count_nonzero(np.isnan(ranges)))
-    if undefined == len(rows):
-        raise _DefectError(Defect.NAN_RANGES)
-    has_return = rules.is_return(ranges)
+    ranges, dropped = ranges_of(points)
+    has_return = rules.returns.among(ranges)
     point_times = None
     if _SWEEP_SHARE in _names(rows):
         point_times = rows[_SWEEP_SHARE][has_return].astype(np.float64)
         if not np.all((point_times >= 0.0) & (point_times <= 1.0)):
-            raise _DefectError(Defect.BAD_GEOMETRY)
+            raise DefectError(Defect.BAD_GEOMETRY)
     points_in_body = transform_points(body_from_sensor, points[has_return])
     scan = Scan(stamp_s, points_in_body, body_from_sensor[:3, 3], point_times)
-    return Decoded(scan, message.frame_id, {Defect.NAN_RANGES: undefined} if undefined else {})
+    return Decoded(scan, message.frame_id, dropped)
 
 
 def _odometry(message: Odometry, rules: _Rules) -> Decoded:
-    rules.check_body(message.body_frame_id)
+    check_frame(message.body_frame_id, rules.body_frames)
     return Decoded(_odometry_reading(message), message.body_frame_id)
 
 
@@ -276,10 +220,10 @@ def _pose_in_frame(message: PoseInFrame, _: _Rules) -> Decoded:
 def _odometry_reading(message: Odometry | PoseInFrame) -> OdometryReading:
     stamp_s = _stamp(message)
     if message.frame_id != ODOMETRY_FRAME:
-        raise _DefectError(Defect.WRONG_FRAME)
+        raise DefectError(Defect.WRONG_FRAME)
     if not message.HasField("pose"):
-        raise _DefectError(Defect.BAD_POSE)
-    return OdometryReading(stamp_s, _pose(message.pose, farthest_m=_MAX_ODOMETRY_M))
+        raise DefectError(Defect.BAD_POSE)
+    return odometry_reading(stamp_s, _quaternion(message.pose), _position(message.pose))
 
 
 _Reader = tuple[type[Message], Callable[[Any, _Rules], Decoded]]
@@ -298,19 +242,6 @@ ODOMETRY_SCHEMAS = frozenset(_ODOMETRY)
 """Full names of the messages that hold odometry."""
 
 
-def _wrong_beams(ranges: FloatArray) -> dict[Defect, int]:
-    """Return how many beams are wrong, by reason; +inf says "no return" (REP 117) and is right."""
-    if len(ranges) == 0:
-        raise _DefectError(Defect.EMPTY)
-    counts = {
-        Defect.NAN_RANGES: int(np.count_nonzero(np.isnan(ranges))),
-        Defect.NEGATIVE_RANGES: int(np.count_nonzero(ranges < 0.0)),
-    }
-    if sum(counts.values()) > _MAX_WRONG_SHARE * len(ranges):
-        raise _DefectError(max(counts, key=lambda reason: counts[reason]))
-    return {reason: count for reason, count in counts.items() if count}
-
-
 def _rows(message: PointCloud) -> npt.NDArray[np.void]:
     """Return a cloud as a structured array, one row per point."""
     stride, fields = message.point_stride, {f.name: f for f in message.fields}
@@ -324,9 +255,9 @@ def _rows(message: PointCloud) -> npt.NDArray[np.void]:
         and len(message.data) % stride == 0
     )
     if not is_consistent:
-        raise _DefectError(Defect.BAD_GEOMETRY)
+        raise DefectError(Defect.BAD_GEOMETRY)
     if not message.data:
-        raise _DefectError(Defect.EMPTY)
+        raise DefectError(Defect.EMPTY)
     dtype = np.dtype(
         {
             "names": list(fields),
@@ -343,23 +274,22 @@ def _names(rows: npt.NDArray[np.void]) -> tuple[str, ...]:
 
 
 def _body_from_sensor(message: LaserScan | PointCloud, rules: _Rules) -> Pose:
-    rules.check_body(message.frame_id)
+    check_frame(message.frame_id, rules.body_frames)
     if not message.HasField("pose"):
         return identity()
-    return _pose(message.pose, farthest_m=_MAX_SENSOR_OFFSET_M)
+    return checked_pose(
+        _quaternion(message.pose), _position(message.pose), farthest_m=MAX_SENSOR_OFFSET_M
+    )
 
 
-def _pose(message: PoseMessage, *, farthest_m: float) -> Pose:
-    p, q = message.position, message.orientation
-    quaternion = [q.x, q.y, q.z, q.w] if message.HasField("orientation") else [0.0, 0.0, 0.0, 1.0]
-    try:
-        with np.errstate(over="ignore"):
-            pose = pose_of(np.array(quaternion), np.array([p.x, p.y, p.z]))
-    except InvalidInput as error:
-        raise _DefectError(Defect.BAD_POSE) from error
-    if np.abs(pose[:3, 3]).max() > farthest_m:
-        raise _DefectError(Defect.BAD_POSE)
-    return pose
+def _quaternion(message: PoseMessage) -> tuple[float, float, float, float]:
+    q = message.orientation
+    return (q.x, q.y, q.z, q.w) if message.HasField("orientation") else (0.0, 0.0, 0.0, 1.0)
+
+
+def _position(message: PoseMessage) -> tuple[float, float, float]:
+    p = message.position
+    return p.x, p.y, p.z
 
 
 def pose_message(pose: Pose) -> PoseMessage:
@@ -372,10 +302,9 @@ def pose_message(pose: Pose) -> PoseMessage:
 
 
 def _stamp(message: LaserScan | PointCloud | Odometry | PoseInFrame) -> float:
-    stamp = message.timestamp
-    if not message.HasField("timestamp") or not 0 <= stamp.nanos < _NANOSECONDS:
-        raise _DefectError(Defect.BAD_STAMP)
-    return (stamp.seconds * _NANOSECONDS + stamp.nanos) / _NANOSECONDS
+    if not message.HasField("timestamp"):
+        raise DefectError(Defect.BAD_STAMP)
+    return stamp_of(message.timestamp.seconds, message.timestamp.nanos)
 
 
 def timestamp_of(stamp_s: float) -> Timestamp:
@@ -388,5 +317,5 @@ def timestamp_of(stamp_s: float) -> Timestamp:
         raise InvalidInput(f"stamp {stamp_s} s is not finite")
     whole = math.floor(stamp_s)
     # Exact: the difference of two floats so near has no rounding.
-    seconds, nanos = divmod(round((stamp_s - whole) * _NANOSECONDS), _NANOSECONDS)
+    seconds, nanos = divmod(round((stamp_s - whole) * NANOSECONDS), NANOSECONDS)
     return Timestamp(seconds=whole + seconds, nanos=nanos)

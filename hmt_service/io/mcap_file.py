@@ -1,4 +1,4 @@
-"""MCAP files: the protobuf messages in them, in the order of time, as far as they can be read.
+"""MCAP files: the messages of foxglove and ROS in them, by time, as far as they can be read.
 
 A file without an index, as a crash leaves it, is read from its beginning; a damaged chunk costs
 what is in it.
@@ -12,9 +12,9 @@ from __future__ import annotations
 import heapq
 import struct
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import BinaryIO
 
 import zstandard
 from mcap.data_stream import ReadDataStream
@@ -23,10 +23,11 @@ from mcap.reader import SeekingReader
 from mcap.records import Channel, Chunk, ChunkIndex, McapRecord, Message, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.summary import Summary
-from mcap.well_known import MessageEncoding
 
 from hmt_service.errors import InvalidLog
 from hmt_service.io.malformed import Tally
+from hmt_service.io.ros_messages import type_name
+from hmt_service.io.topic_log import ENCODINGS, Topic
 
 _OPCODE_AND_LENGTH_BYTES = 9
 # What the library and its decompressors raise on bytes that are no MCAP.
@@ -42,15 +43,6 @@ _DAMAGE = (
 )
 
 
-class Topic(NamedTuple):
-    """One stream of messages of one kind."""
-
-    name: str
-    """Any text."""
-    schema: str
-    """Full name of the messages."""
-
-
 class McapFile:
     """One MCAP file, opened anew by every method."""
 
@@ -59,7 +51,7 @@ class McapFile:
         self.path = path
 
     def topics(self) -> Counter[Topic]:
-        """Return how many protobuf messages every topic has.
+        """Return how many messages every topic has.
 
         Raises:
             InvalidLog: If the file cannot be opened.
@@ -67,7 +59,7 @@ class McapFile:
         with self._open() as file:
             summary = _summary(file)
         if summary is None or summary.statistics is None:
-            return Counter(topic for topic, _ in self.messages(Tally()))
+            return Counter(topic for topic, _ in self._messages(None, Tally()))
         table = _Table(summary)
         counts: Counter[Topic] = Counter()
         for channel, count in summary.statistics.channel_message_counts.items():
@@ -75,24 +67,31 @@ class McapFile:
                 counts[topic] += count
         return counts
 
-    def messages(self, tally: Tally) -> Iterator[tuple[Topic, bytes]]:
-        """Yield topic and payload of every protobuf message that can be read.
+    def messages(self, topics: Collection[Topic], tally: Tally) -> Iterator[tuple[Topic, bytes]]:
+        """Yield topic and payload of every message of these topics that can be read.
 
         Raises:
             InvalidLog: If the file cannot be opened.
         """
+        return self._messages(frozenset(topics), tally)
+
+    def _messages(
+        self, topics: Collection[Topic] | None, tally: Tally
+    ) -> Iterator[tuple[Topic, bytes]]:
         with self._open() as file:
             summary = _summary(file)
             table = _Table(summary)
             records = (
-                _by_time(file, summary.chunk_indexes, tally)
+                _by_time(file, _chunks_with(topics, summary, table), tally)
                 if summary is not None and summary.chunk_indexes
                 else _as_written(file, self.path.stat().st_size, tally)
             )
             for record in records:
                 if not isinstance(record, Message):
                     table.learn(record)
-                elif (topic := table.topic(record.channel_id)) is not None:
+                    continue
+                topic = table.topic(record.channel_id)
+                if topic is not None and (topics is None or topic in topics):
                     yield topic, record.data
 
     def _open(self) -> BinaryIO:
@@ -116,14 +115,14 @@ class _Table:
             self._channels[record.id] = record
 
     def topic(self, channel_id: int) -> Topic | None:
-        """Return the topic of a channel, None when it is unknown or its messages no protobuf."""
+        """Return the topic of a channel, None when it or its encoding is unknown."""
         channel = self._channels.get(channel_id)
         schema = self._schemas.get(channel.schema_id) if channel else None
         if channel is None or schema is None:
             return None
-        if channel.message_encoding != MessageEncoding.Protobuf:
+        if channel.message_encoding not in ENCODINGS:
             return None
-        return Topic(channel.topic, schema.name)
+        return Topic(channel.topic, type_name(schema.name), channel.message_encoding)
 
 
 def _summary(file: BinaryIO) -> Summary | None:
@@ -132,6 +131,22 @@ def _summary(file: BinaryIO) -> Summary | None:
         return SeekingReader(file).get_summary()
     except _DAMAGE:
         return None
+
+
+def _chunks_with(
+    topics: Collection[Topic] | None, summary: Summary, table: _Table
+) -> Iterable[ChunkIndex]:
+    """Return the chunks that may hold messages of these topics; None for any."""
+    if topics is None:
+        return summary.chunk_indexes
+    # A channel that the summary does not know may be one of them.
+    others = {c for c in summary.channels if table.topic(c) not in topics}
+    return [
+        chunk
+        for chunk in summary.chunk_indexes
+        # A file need not say what is in its chunks.
+        if not chunk.message_index_offsets or not chunk.message_index_offsets.keys() <= others
+    ]
 
 
 def _by_time(file: BinaryIO, chunks: Iterable[ChunkIndex], tally: Tally) -> Iterator[McapRecord]:

@@ -17,7 +17,7 @@ from typing import BinaryIO
 
 from hmt_service.core.types import Reading, StampedPose
 from hmt_service.errors import InvalidInput, Unavailable
-from hmt_service.io.mcap_log import McapWriter
+from hmt_service.io.mcap_writer import McapWriter
 from hmt_service.io.trajectory import tum_line
 
 LOG, TRUTH, PLACES, WORLD = "log.mcap", "truth.tum", "places.csv", "world.json"

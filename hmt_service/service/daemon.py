@@ -25,6 +25,7 @@ from hmt_service.service.intake import IntakeLimits
 from hmt_service.service.keys import Keys
 from hmt_service.service.metrics import metrics_server
 from hmt_service.service.reports import Status
+from hmt_service.service.ros2 import Ros2Input
 from hmt_service.service.session import Endpoints, open_session
 
 if TYPE_CHECKING:
@@ -50,6 +51,8 @@ class DaemonSettings:
     """Where it meets others."""
     config: Config
     """Settings of the mapping core."""
+    ros2: Ros2Input = field(default_factory=Ros2Input)
+    """What to take from ROS 2 beside the robot's own keys."""
     seed: int = 0
     """Seed of the engine's random generator."""
     save: Save | None = None
@@ -126,6 +129,7 @@ class Daemon:
                 settings.keys,
                 settings.config,
                 pipeline,
+                ros2=settings.ros2,
                 limits=settings.limits,
                 shut_down=lambda: self.request_stop("a client"),
             )

@@ -16,6 +16,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable
+from functools import partial
 
 import zenoh
 
@@ -32,6 +33,7 @@ from hmt_service.core.types import (
     Tracking,
 )
 from hmt_service.errors import DaemonFailure, HmtError, InvalidInput, Unavailable
+from hmt_service.io.ros_messages import RosType
 from hmt_service.runtime.localization import Localizer
 from hmt_service.runtime.messages import (
     AreaRequest,
@@ -53,7 +55,9 @@ from hmt_service.service.delivery import Deliveries
 from hmt_service.service.intake import Intake, IntakeLimits
 from hmt_service.service.keys import Call, Control, Input, Keys, Topic
 from hmt_service.service.questions import Name, Question, receive
+from hmt_service.service.readings import ReadingDecoder
 from hmt_service.service.reports import Ack, DaemonState, Status
+from hmt_service.service.ros2 import Ros2Input, encoding_under, input_of
 from hmt_service.service.senders import Senders
 
 _LOG = logging.getLogger(__name__)
@@ -77,6 +81,7 @@ class Gateway:
         config: Config,
         pipeline: Pipeline,
         *,
+        ros2: Ros2Input,
         limits: IntakeLimits,
         shut_down: Callable[[], None],
     ) -> None:
@@ -87,6 +92,7 @@ class Gateway:
             keys: Under which names.
             config: Settings of the mapping core.
             pipeline: Where readings and slow calls go; stays the caller's.
+            ros2: What to take from ROS 2 beside the robot's own keys.
             limits: What may wait at the input.
             shut_down: Called when a client asks for it.
         """
@@ -95,7 +101,9 @@ class Gateway:
         self._config = config
         self._pipeline = pipeline
         self._shut_down = shut_down
-        self._intake = Intake(config.sensor, limits, submit=pipeline.submit, finish=pipeline.finish)
+        self._ros2 = ros2
+        decoder = ReadingDecoder(config.sensor, ros2.body_from_sensor)
+        self._intake = Intake(decoder, limits, submit=pipeline.submit, finish=pipeline.finish)
         self._localizer = Localizer()
         self._deliveries = Deliveries()
         self._senders = Senders()
@@ -119,8 +127,10 @@ class Gateway:
         # In the receiving thread itself: what a client sent before it asked is in the queue when
         # its question arrives (measured: with a thread of its own, `finish` overtook up to 50 of
         # 4,000 scans).
-        on_sample = zenoh.handlers.Callback(self._on_sample, indirect=False)
-        self._subscriber = self._session.declare_subscriber(self._keys.inputs, on_sample)
+        self._subscribers = [self._subscribe(self._keys.inputs, self._on_sample)]
+        for key, kind in self._ros2.keys().items():
+            encoding_under(key, kind)  # loads what it needs, for which no sample should wait
+            self._subscribers.append(self._subscribe(key, partial(self._on_ros_sample, kind)))
         self._queryables = [
             self._session.declare_queryable(self._keys.calls, self._on_call),
             self._session.declare_queryable(self._keys.controls, self._on_control),
@@ -133,7 +143,8 @@ class Gateway:
         # Samples still come while a subscriber is undeclared: behind the last `Finish` they would
         # be mapped after the map was saved.
         self._intake.close()
-        self._subscriber.undeclare()
+        for subscriber in self._subscribers:
+            subscriber.undeclare()
 
     def close(self) -> None:
         """Take everything back; calls that still wait get an error."""
@@ -260,6 +271,20 @@ class Gateway:
         message = f"{new.total()} samples refused: {reasons}"
         numbers = {reason: float(count) for reason, count in new.items()}
         self.publish([Event(EventKind.INPUT_DROPPED, self.stamp_s, message, numbers)])
+
+    def _subscribe(
+        self, key: str, on_sample: Callable[[zenoh.Sample], None]
+    ) -> zenoh.Subscriber[None]:
+        callback = zenoh.handlers.Callback(on_sample, indirect=False)
+        return self._session.declare_subscriber(key, callback)
+
+    def _on_ros_sample(self, kind: RosType, sample: zenoh.Sample) -> None:
+        encoding = encoding_under(str(sample.key_expr), kind)
+        self._intake.offer(
+            input_of(kind) if sample.kind == zenoh.SampleKind.PUT else None,
+            len(sample.payload),
+            lambda: (sample.payload.to_bytes(), encoding),
+        )
 
     def _on_sample(self, sample: zenoh.Sample) -> None:
         name = str(sample.key_expr).rpartition("/")[2]

@@ -11,14 +11,13 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from hmt_service.core.config import SensorConfig
 from hmt_service.core.ordering import ReorderWindow
 from hmt_service.core.types import Reading
-from hmt_service.io.foxglove import Decoded, Defect
+from hmt_service.io.decoding import Decoded, Defect
 from hmt_service.runtime.messages import Finish
 from hmt_service.runtime.queues import SizedQueue
 from hmt_service.service.keys import Input
-from hmt_service.service.readings import Refusal, decode_reading
+from hmt_service.service.readings import ReadingDecoder, Refusal
 from hmt_service.service.reports import InputCounts
 
 _OVERHEAD_BYTES = 500
@@ -29,8 +28,9 @@ _OVERHEAD_BYTES = 500
 class IntakeLimits:
     """What the way in can hold."""
 
-    sample_bytes: int = 8_000_000
-    """Largest sample; a larger one is refused before it is parsed."""
+    sample_bytes: int = 16_000_000
+    """Largest sample; a larger one is refused before it is parsed. The clouds of a LiDAR of 128
+    rows of 2,048 points come with 48 bytes per point."""
     queue_bytes: int = 256_000_000
     """Memory for samples that wait."""
     reorder_s: float = 0.25
@@ -55,7 +55,7 @@ class Intake:
 
     def __init__(
         self,
-        sensor: SensorConfig,
+        decoder: ReadingDecoder,
         limits: IntakeLimits,
         *,
         submit: Callable[[Reading], bool],
@@ -64,12 +64,12 @@ class Intake:
         """Prepare; `start` starts.
 
         Args:
-            sensor: What the sensor can see.
+            decoder: Reads the samples, in the thread here.
             limits: What may wait here.
             submit: Takes the readings in order, and may block.
             finish: Takes the `Finish` behind the readings that came before it.
         """
-        self._sensor = sensor
+        self._decoder = decoder
         self._limits = limits
         self._submit = submit
         self._finish = finish
@@ -177,7 +177,7 @@ class Intake:
                 return self._window.finish()
 
     def _take(self, sample: _Sample) -> tuple[Reading, ...]:
-        decoded = decode_reading(sample.name, sample.payload, sample.encoding, self._sensor)
+        decoded = self._decoder.decode(sample.name, sample.payload, sample.encoding)
         if not isinstance(decoded, Decoded):
             with self._lock:
                 self._refused[decoded] += 1

@@ -20,9 +20,10 @@ from hmt_service.core.engine import Engine
 from hmt_service.core.odometry import Odometry
 from hmt_service.errors import NotFound, Unavailable
 from hmt_service.io.logs import read_log
-from hmt_service.io.mcap_log import McapWriter
+from hmt_service.io.mcap_writer import McapWriter
 from hmt_service.io.trajectory import read_tum
 from tests.flat import SETTINGS, path, ranges_from, readings
+from tests.ros import Ros, write_bag2
 from tests.service.harness import RunningDaemon, as_received, running_daemon
 
 SCANS = 200
@@ -195,6 +196,14 @@ def test_an_mcap_log_is_replayed_as_it_is_read(tmp_path: Path) -> None:
     assert "120 readings sent, refused none; 60 scans new" in result.output
     assert "malformed and left out: 1" in result.output
     assert "the file ends or cannot be read from here on" in result.output
+
+
+def test_a_bag_of_ros_is_replayed(tmp_path: Path) -> None:
+    bag = write_bag2(tmp_path / "flat", Ros().drive(30))
+    with running_daemon(tmp_path / "out") as daemon:
+        result = hmt(daemon, "replay", str(bag), "--sensor-pose", *"000000")
+    assert "30 scans, 30 odometry readings" in result.output
+    assert "60 readings sent, refused none; 30 scans new" in result.output
 
 
 def test_a_command_without_daemon_says_where_it_looked() -> None:

@@ -11,12 +11,13 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from hmt_service.cli.app import app
-from hmt_service.core.geometry import inverse, yaw_of
+from hmt_service.core.geometry import inverse, planar_pose, yaw_of
 from hmt_service.io.map_check import check_map
 from hmt_service.io.map_file import read_map
 from hmt_service.io.relations import evaluate, read_relations
 from hmt_service.io.trajectory import read_tum
-from tests.flat import path, ranges_from
+from tests.flat import BEAMS, path, ranges_from
+from tests.ros import Ros, Stamped, write_bag2
 
 SCANS = 240
 BEARINGS = np.radians(np.arange(180) - 90.0)
@@ -58,6 +59,32 @@ def test_run_writes_a_pose_per_scan_near_the_truth(log: Path, tmp_path: Path) ->
     ]
     assert np.max(errors) < 0.05
     assert poses[0].stamp_s == pytest.approx(100.0)
+
+
+def test_a_bag_of_ros_is_run_with_its_laser_upside_down_and_sideways(tmp_path: Path) -> None:
+    truth, bearings = path(SCANS), np.linspace(-np.pi, np.pi, BEAMS, endpoint=False)
+    body_from_sensor = planar_pose(0.2, 0.0, np.pi / 2.0)
+    sent: list[Stamped] = []
+    for index, world_from_body in enumerate(truth):
+        stamp_s = 100.0 + 0.2 * index
+        ranges = ranges_from(world_from_body @ body_from_sensor, -bearings)
+        odom_from_body = inverse(truth[0]) @ world_from_body
+        sent.append(("/odom", stamp_s, Ros().odometry(odom_from_body, stamp_s=stamp_s)))
+        sent.append(("/scan", stamp_s, Ros().laser_scan(ranges, stamp_s=stamp_s)))
+    pose = ("--sensor-pose", "0.2", "0", "0", "180", "0", "90")
+    result = run(write_bag2(tmp_path / "flat", sent), tmp_path / "out", *pose)
+    assert f"{SCANS} scans, {SCANS} odometry readings" in result.stderr
+    assert "malformed" not in result.stderr
+    for found, true in zip(read_tum(tmp_path / "out" / "trajectory.tum"), truth, strict=True):
+        at = (truth[0] @ found.reference_from_body)[:2, 3]
+        np.testing.assert_allclose(at, true[:2, 3], atol=0.05)
+
+
+def test_a_pose_of_the_sensor_is_for_ros(log: Path, tmp_path: Path) -> None:
+    result = run(log, tmp_path, "--sensor-pose", *"000000")
+    assert "say where the laser sits" in str(result.exception)
+    result = run(log, tmp_path, "--sensor-pose", *"00000", "nan")
+    assert "not finite" in str(result.exception)
 
 
 def test_run_reports_malformed_lines_by_number(log: Path, tmp_path: Path) -> None:

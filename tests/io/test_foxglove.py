@@ -19,7 +19,8 @@ from hypothesis import strategies as st
 from hmt_service.core.geometry import FloatArray, planar_pose
 from hmt_service.core.types import OdometryReading, Reading, Scan
 from hmt_service.errors import InvalidInput
-from hmt_service.io.foxglove import ODOMETRY_SCHEMAS, SCAN_SCHEMAS, Decoded, Defect, decode, encode
+from hmt_service.io.decoding import Decoded, Defect
+from hmt_service.io.foxglove import ODOMETRY_SCHEMAS, SCAN_SCHEMAS, decode, encode
 from tests.messages import cloud, laser_scan, odometry
 
 NAN, INF = math.nan, math.inf
@@ -148,7 +149,7 @@ def test_a_log_may_call_the_body_as_it_likes(message: Message) -> None:
     for names in (None, {"lidar"}):
         result = decoded(message, body_frames=names)
         assert isinstance(result, Decoded)
-        assert result.body_frame == "lidar"
+        assert result.frame == "lidar"
 
 
 # ------------------------------------------------------------------ there and back

@@ -8,7 +8,7 @@ import pytest
 
 from hmt_service.errors import InvalidLog
 from hmt_service.io.logs import read_log
-from hmt_service.io.mcap_log import McapWriter
+from hmt_service.io.mcap_writer import McapWriter
 from tests.flat import readings
 
 
@@ -33,7 +33,7 @@ def test_mcap_names_reach_the_mcap_reader(tmp_path: Path, name: str) -> None:
     assert (log.scans, log.odometry, len(list(log.readings))) == (2, 2, 4)
 
 
-@pytest.mark.parametrize("name", ["run.bag", "run", "run.gz"])
+@pytest.mark.parametrize("name", ["run.zip", "run", "run.gz"])
 def test_unknown_format_is_refused_with_the_known_ones(tmp_path: Path, name: str) -> None:
-    with pytest.raises(InvalidLog, match=r"unknown format .*\.clf, \.log, \.mcap"):
+    with pytest.raises(InvalidLog, match=r"unknown format .*\.clf, \.log, \.mcap, \.bag"):
         read_log(tmp_path / name, min_range_m=0.1, max_range_m=40.0)

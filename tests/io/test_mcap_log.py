@@ -27,8 +27,10 @@ from mcap_protobuf.schema import register_schema
 from hmt_service.core.geometry import exp, planar_pose
 from hmt_service.core.types import OdometryReading, Reading, Scan
 from hmt_service.errors import InvalidInput, InvalidLog
-from hmt_service.io.foxglove import Defect
-from hmt_service.io.mcap_log import McapLog, McapWriter, read_mcap
+from hmt_service.io.decoding import Defect
+from hmt_service.io.mcap_file import McapFile
+from hmt_service.io.mcap_writer import McapWriter
+from hmt_service.io.topic_log import TopicLog, read_topics
 from tests.flat import readings
 from tests.messages import cloud, laser_scan, odometry, stamp
 
@@ -36,8 +38,8 @@ EVERYTHING_M = 1e6
 Sent = tuple[str, Message]
 
 
-def read(path: Path) -> McapLog:
-    return read_mcap(path, min_range_m=0.0, max_range_m=EVERYTHING_M)
+def read(path: Path) -> TopicLog:
+    return read_topics(McapFile(path), min_range_m=0.0, max_range_m=EVERYTHING_M)
 
 
 def written(path: Path, sent: Sequence[Reading]) -> Path:
@@ -82,7 +84,7 @@ def recorded(
     return path
 
 
-def keys(log: McapLog) -> list[tuple[float, bool]]:
+def keys(log: TopicLog) -> list[tuple[float, bool]]:
     return [(reading.stamp_s, isinstance(reading, Scan)) for reading in log.readings]
 
 
@@ -220,7 +222,7 @@ def test_a_file_of_one_topic_after_the_other_is_read_by_time(tmp_path: Path, fir
     assert keys(log) == [(float(s), is_scan) for s in range(40) for is_scan in (False, True)]
 
 
-def unordered(path: Path, sent: Sequence[Sent]) -> McapLog:
+def unordered(path: Path, sent: Sequence[Sent]) -> TopicLog:
     """Read messages in exactly this order: without an index there is no other."""
     return read(recorded(path, sent, is_complete=False))
 

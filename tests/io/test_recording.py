@@ -11,7 +11,7 @@ import pytest
 from hmt_service.core.geometry import planar_pose
 from hmt_service.core.types import StampedPose
 from hmt_service.errors import InvalidInput, Unavailable
-from hmt_service.io.mcap_log import read_mcap
+from hmt_service.io.logs import read_log
 from hmt_service.io.recording import recording
 from hmt_service.io.trajectory import read_tum
 from tests.flat import readings
@@ -39,7 +39,7 @@ def test_a_recording_holds_log_truth_places_and_what_was_declared(tmp_path: Path
     record(tmp_path / "new" / "folder")
     folder = tmp_path / "new" / "folder"
     assert names(folder) == NAMES
-    log = read_mcap(folder / "log.mcap", min_range_m=0.0, max_range_m=100.0)
+    log = read_log(folder / "log.mcap", min_range_m=0.0, max_range_m=100.0)
     assert (log.scans, log.odometry) == (3, 3)
     for before, after in zip(TRUTH, read_tum(folder / "truth.tum"), strict=True):
         assert after.stamp_s == pytest.approx(before.stamp_s, abs=1e-6)

@@ -15,6 +15,7 @@ from hmt_service.client.local import free_endpoint, is_running
 from hmt_service.core.config import Config, Preset, SensorConfig
 from hmt_service.core.types import Reading
 from hmt_service.io import foxglove
+from hmt_service.io.decoding import Decoded
 from hmt_service.runtime.messages import (
     Finish,
     Finished,
@@ -30,6 +31,7 @@ from hmt_service.service.gateway import Gateway
 from hmt_service.service.intake import IntakeLimits
 from hmt_service.service.keys import Keys
 from hmt_service.service.reports import DaemonState
+from hmt_service.service.ros2 import Ros2Input
 from hmt_service.service.session import Endpoints, open_session
 from tests.flat import SETTINGS
 
@@ -126,7 +128,7 @@ def as_received(reading: Reading, sensor: SensorConfig) -> Reading:
         min_range_m=sensor.min_range_m,
         max_range_m=sensor.max_range_m,
     )
-    assert isinstance(received, foxglove.Decoded)
+    assert isinstance(received, Decoded)
     return received.reading
 
 
@@ -180,6 +182,7 @@ def serving(endpoints: Endpoints, *, robot: str = "robot") -> Iterator[NoMap]:
             Keys("site", robot),
             Config(),
             pipeline,
+            ros2=Ros2Input(),
             limits=IntakeLimits(),
             shut_down=pipeline.shut_down,
         )

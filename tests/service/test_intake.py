@@ -11,7 +11,7 @@ from hmt_service.runtime.messages import Finish, Wire
 from hmt_service.service.codec import encoding_of
 from hmt_service.service.intake import Intake, IntakeLimits
 from hmt_service.service.keys import Input
-from hmt_service.service.readings import encode_reading
+from hmt_service.service.readings import ReadingDecoder, encode_reading
 from tests.flat import readings
 from tests.messages import laser_scan
 from tests.service.harness import wait_until
@@ -45,7 +45,7 @@ def sink() -> Sink:
 
 @pytest.fixture
 def intake(sink: Sink) -> Iterator[Intake]:
-    intake = Intake(SensorConfig(), LIMITS, submit=sink.submit, finish=sink.finish)
+    intake = Intake(ReadingDecoder(SensorConfig()), LIMITS, submit=sink.submit, finish=sink.finish)
     intake.start()
     yield intake
     sink.gate.set()

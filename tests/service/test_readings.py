@@ -7,10 +7,10 @@ from foxglove_schemas_protobuf.LaserScan_pb2 import LaserScan
 from hmt_service.core.config import SensorConfig
 from hmt_service.core.geometry import planar_pose
 from hmt_service.core.types import OdometryReading, Reading, Scan
-from hmt_service.io.foxglove import Decoded, Defect
+from hmt_service.io.decoding import Decoded, Defect
 from hmt_service.service.codec import encoding_of
 from hmt_service.service.keys import Input
-from hmt_service.service.readings import Refusal, decode_reading, encode_reading
+from hmt_service.service.readings import ReadingDecoder, Refusal, encode_reading
 from tests.messages import laser_scan
 
 SENSOR = SensorConfig(min_range_m=0.5, max_range_m=30.0)
@@ -26,7 +26,7 @@ LASER = encoding_of(LaserScan)
 )
 def test_what_is_sent_is_what_arrives(name: Input, reading: Reading) -> None:
     message = encode_reading(reading)
-    result = decode_reading(name, message.payload, message.encoding, SENSOR)
+    result = ReadingDecoder(SENSOR).decode(name, message.payload, message.encoding)
     assert isinstance(result, Decoded)
     assert type(result.reading) is type(reading)
     assert result.reading.stamp_s == reading.stamp_s
@@ -34,7 +34,7 @@ def test_what_is_sent_is_what_arrives(name: Input, reading: Reading) -> None:
 
 def test_the_sensor_says_what_is_a_return() -> None:
     payload = laser_scan([0.4, 1.0, 31.0, 30.0]).SerializeToString()
-    result = decode_reading(Input.SCAN, payload, LASER, SENSOR)
+    result = ReadingDecoder(SENSOR).decode(Input.SCAN, payload, LASER)
     assert isinstance(result, Decoded)
     assert isinstance(result.reading, Scan)
     assert len(result.reading.points_in_body) == 2
@@ -52,11 +52,11 @@ def test_the_sensor_says_what_is_a_return() -> None:
 )
 def test_a_message_sent_as_something_else_is_refused(name: Input, encoding: str) -> None:
     payload = laser_scan([1.0]).SerializeToString()
-    assert decode_reading(name, payload, encoding, SENSOR) is Refusal.WRONG_ENCODING
+    assert ReadingDecoder(SENSOR).decode(name, payload, encoding) is Refusal.WRONG_ENCODING
 
 
 def test_a_defect_is_the_reason_of_a_refusal() -> None:
     message = laser_scan([1.0])
     message.frame_id = "laser"
-    result = decode_reading(Input.SCAN, message.SerializeToString(), LASER, SENSOR)
+    result = ReadingDecoder(SENSOR).decode(Input.SCAN, message.SerializeToString(), LASER)
     assert result is Defect.WRONG_FRAME

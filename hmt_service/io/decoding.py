@@ -1,0 +1,225 @@
+"""What every message of a robot is held to before it is a reading, whatever its format.
+
+References:
+    ROS REP 117 (what infinite and undefined ranges mean), REP 105 (names of frames).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from types import MappingProxyType
+
+import numpy as np
+import numpy.typing as npt
+
+from hmt_service.core.geometry import FloatArray, Pose, pose_of, transform_points
+from hmt_service.core.types import OdometryReading, Reading, Scan
+from hmt_service.errors import InvalidInput
+
+BODY_FRAMES = frozenset({"body", "base_link"})
+"""Names of the body frame: ours and ROS's."""
+MAX_SENSOR_OFFSET_M = 1e3
+"""Farther than any sensor from its robot: beyond it numbers lose their meaning."""
+NANOSECONDS = 10**9
+"""Of a second."""
+_MAX_ODOMETRY_M = 1e7  # the same of any robot from its start
+_MAX_WRONG_SHARE = 0.5
+# A range written with centimetres and rebuilt from coordinates must not fall off the end of the
+# sensor.
+_RANGE_TOLERANCE_M = 1e-6
+_FULL_TURN_RAD = 2.0 * np.pi + 1e-6
+
+
+class Defect(StrEnum):
+    """Why a message is no reading, or a reading does not fit those before it."""
+
+    NOT_PROTOBUF = "not_protobuf"
+    NOT_ROS = "not_ros"
+    WRONG_FRAME = "wrong_frame"
+    BAD_STAMP = "bad_stamp"
+    BAD_POSE = "bad_pose"
+    BAD_GEOMETRY = "bad_geometry"
+    EMPTY = "empty"
+    NAN_RANGES = "nan_ranges"
+    NEGATIVE_RANGES = "negative_ranges"
+    TIME_BACKWARDS = "time_backwards"
+    TIME_JUMPED = "time_jumped"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Decoded:
+    """A reading that passed every check that needs no other reading."""
+
+    reading: Reading
+    """What the robot said."""
+    frame: str | None = None
+    """Frame that the message is of: a scan's own, the body of odometry; None where it does not
+    say."""
+    dropped_beams: Mapping[Defect, int] = field(default_factory=lambda: MappingProxyType({}))
+    """Beams that are left out of it because they are wrong; those without a return are not."""
+
+
+class DefectError(Exception):
+    """Carries a defect out of the checks below to the decoder that asked for them."""
+
+    def __init__(self, defect: Defect) -> None:
+        super().__init__(defect)
+        self.defect = defect
+
+
+@dataclass(frozen=True, slots=True)
+class Returns:
+    """Which points of a scan are returns."""
+
+    min_range_m: float
+    """Nearer points count as no return."""
+    max_range_m: float
+    """Farther points count as no return."""
+
+    def among(self, ranges: FloatArray) -> npt.NDArray[np.bool_]:
+        """Return which of these ranges are returns, shape as given; NaN is none."""
+        nearest = self.min_range_m - _RANGE_TOLERANCE_M
+        farthest = self.max_range_m + _RANGE_TOLERANCE_M
+        return (ranges >= nearest) & (ranges <= farthest)
+
+
+def names_of_body(frame: str) -> Collection[str]:
+    """Return what else a body of this name may be called by the same sender."""
+    return BODY_FRAMES if frame in BODY_FRAMES else {frame}
+
+
+def check_frame(frame: str, allowed: Collection[str] | None) -> None:
+    """Check that a message is of one of these frames; None allows any.
+
+    Raises:
+        DefectError: If it is of another.
+    """
+    if allowed is not None and frame not in allowed:
+        raise DefectError(Defect.WRONG_FRAME)
+
+
+def stamp_of(seconds: int, nanoseconds: int) -> float:
+    """Return a stamp in s.
+
+    Raises:
+        DefectError: If the nanoseconds are a second or more, or negative.
+    """
+    if not 0 <= nanoseconds < NANOSECONDS:
+        raise DefectError(Defect.BAD_STAMP)
+    return (seconds * NANOSECONDS + nanoseconds) / NANOSECONDS
+
+
+def checked_pose(
+    quaternion: tuple[float, float, float, float],
+    translation_m: tuple[float, float, float],
+    *,
+    farthest_m: float,
+) -> Pose:
+    """Return a pose of a message.
+
+    Args:
+        quaternion: x, y, z, w; of any length but 0.
+        translation_m: x, y, z.
+        farthest_m: Largest coordinate that makes sense.
+
+    Raises:
+        DefectError: If it is no pose, or too far away.
+    """
+    try:
+        with np.errstate(over="ignore"):
+            pose = pose_of(np.array(quaternion), np.array(translation_m))
+    except InvalidInput as error:
+        raise DefectError(Defect.BAD_POSE) from error
+    if np.abs(pose[:3, 3]).max() > farthest_m:
+        raise DefectError(Defect.BAD_POSE)
+    return pose
+
+
+def odometry_reading(
+    stamp_s: float,
+    quaternion: tuple[float, float, float, float],
+    translation_m: tuple[float, float, float],
+) -> OdometryReading:
+    """Return what odometry says, see `checked_pose`.
+
+    Raises:
+        DefectError: If it is no pose, or farther away than any robot comes.
+    """
+    pose = checked_pose(quaternion, translation_m, farthest_m=_MAX_ODOMETRY_M)
+    return OdometryReading(stamp_s, pose)
+
+
+def check_angles(start_rad: float, span_rad: float) -> None:
+    """Check where the beams of a planar scan begin and end.
+
+    Raises:
+        DefectError: If they turn more than once, or these are no angles.
+    """
+    # NaN fails every comparison, and with it the check.
+    if not (abs(span_rad) <= _FULL_TURN_RAD and abs(start_rad) <= 2.0 * _FULL_TURN_RAD):
+        raise DefectError(Defect.BAD_GEOMETRY)
+
+
+def wrong_beams(ranges: FloatArray) -> dict[Defect, int]:
+    """Return how many beams are wrong, by reason; +inf says "no return" (REP 117) and is right.
+
+    Raises:
+        DefectError: If there is none, or most are wrong.
+    """
+    if len(ranges) == 0:
+        raise DefectError(Defect.EMPTY)
+    counts = {
+        Defect.NAN_RANGES: int(np.count_nonzero(np.isnan(ranges))),
+        Defect.NEGATIVE_RANGES: int(np.count_nonzero(ranges < 0.0)),
+    }
+    if sum(counts.values()) > _MAX_WRONG_SHARE * len(ranges):
+        raise DefectError(max(counts, key=lambda reason: counts[reason]))
+    return {reason: count for reason, count in counts.items() if count}
+
+
+def planar_scan(
+    stamp_s: float,
+    ranges: FloatArray,
+    angles_rad: FloatArray,
+    has_return: npt.NDArray[np.bool_],
+    body_from_sensor: Pose,
+    point_times: FloatArray | None = None,
+) -> Scan:
+    """Return the scan of a planar laser.
+
+    Args:
+        stamp_s: Its stamp.
+        ranges: Distance of each beam, shape (N,), m.
+        angles_rad: Direction of each beam in the plane of the sensor, shape (N,).
+        has_return: Which of them hit anything, shape (N,).
+        body_from_sensor: Pose of the sensor.
+        point_times: Capture time of each beam as a share of the sweep, shape (N,); None: at once.
+    """
+    angles, in_plane = angles_rad[has_return], np.zeros(np.count_nonzero(has_return))
+    directions = np.stack([np.cos(angles), np.sin(angles), in_plane], axis=1)
+    points = ranges[has_return, None] * directions
+    times = None if point_times is None else point_times[has_return]
+    points_in_body = transform_points(body_from_sensor, points)
+    return Scan(stamp_s, points_in_body, body_from_sensor[:3, 3], times)
+
+
+def ranges_of(points: FloatArray) -> tuple[FloatArray, dict[Defect, int]]:
+    """Return the distance of each point of a cloud, and how many are wrong.
+
+    Args:
+        points: Points seen from the sensor, shape (N, 3), m.
+
+    Raises:
+        DefectError: If all of them are NaN.
+    """
+    # Huge numbers, and NaN that signal.
+    with np.errstate(over="ignore", invalid="ignore"):
+        ranges = np.linalg.norm(points, axis=1)
+    # Organised clouds mark directions without a return by NaN: only a cloud of nothing else is
+    # wrong.
+    undefined = int(np.count_nonzero(np.isnan(ranges)))
+    if undefined == len(points):
+        raise DefectError(Defect.NAN_RANGES)
+    return ranges, {Defect.NAN_RANGES: undefined} if undefined else {}
