@@ -161,7 +161,7 @@ class TransitionConfig(Section):
     """Most known areas that one entry is compared with: the nearest."""
     outside_share: float = Field(default=0.1, gt=0.0, lt=1.0)
     """Prior probability that a robot that wakes up is at a place that its map does not know."""
-    carried_share: float = Field(default=0.001, gt=0.0, lt=1.0)
+    carried_share: float = Field(default=0.003, gt=0.0, lt=1.0)
     """Prior probability that a robot whose scans do not fit any more has been carried elsewhere."""
     max_carried_areas: int = Field(default=32, ge=1)
     """Most known areas that it may have been carried to: the nearest."""

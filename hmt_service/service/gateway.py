@@ -48,6 +48,7 @@ from hmt_service.runtime.messages import (
     RunReport,
     SaveRequest,
     TrajectoryRequest,
+    Wire,
 )
 from hmt_service.runtime.pipeline import Pipeline
 from hmt_service.service.codec import Value, encode
@@ -110,6 +111,8 @@ class Gateway:
         self._snapshot: Snapshot | None = None
         self._report = RunReport(0, 0.0, 0.0)
         self._audit = Audit(events=_KEPT_EVENTS, beliefs=_KEPT_BELIEFS)
+        self._changes = 0
+        self._encoded: dict[Call, tuple[int, Wire]] = {}
         self._lock = threading.Lock()
         self._is_stopping = False
         self._finishes = 0
@@ -201,6 +204,7 @@ class Gateway:
             level = logging.WARNING if event.kind in _WARNINGS else logging.INFO
             _LOG.log(level, "%s: %s", event.kind, event.message, extra={"event": event})
             self._audit.note([event])
+            self._changes += 1
             self._put(Topic.EVENT, event)
 
     def status(self) -> Status:
@@ -239,6 +243,7 @@ class Gateway:
             self._snapshot = mapped.snapshot
             self._localizer.update(mapped.snapshot)
             self._audit.believe(belief_of(mapped.snapshot.posterior))
+            self._changes += 1
             self._put(Topic.POSTERIOR, mapped.snapshot.posterior)
         self.publish(mapped.events)
         if mapped.finished is not None:
@@ -341,9 +346,13 @@ class Gateway:
                     question,
                     CompareRequest(question.integer("reference"), question.integer("hypothesis")),
                 )
-            case _:
+            case Call.STATUS | Call.POSE:
                 question.allow()
                 return self._latest(question.name)
+            case _:
+                question.allow()
+                question.reply(self._latest_encoded(question.name))
+                return None
 
     def _handle_control(self, question: Question[Control]) -> Value | None:
         question.allow()
@@ -358,6 +367,15 @@ class Gateway:
             case Control.SHUTDOWN:
                 self._shut_down()
                 return self._ack()
+
+    def _latest_encoded(self, call: Call) -> Wire:
+        """Return an answer as it was sent before, unless it has changed: who asks next waits."""
+        changes = self._changes
+        known, wire = self._encoded.get(call, (-1, None))
+        if wire is None or known != changes:
+            wire = encode(self._latest(call))
+            self._encoded[call] = changes, wire
+        return wire
 
     def _latest(self, call: Call) -> Value:
         match call:
