@@ -106,10 +106,10 @@ def _map(
 
 
 def _warn(console: Console, event: Event) -> None:
-    """Print an event when it says something of the settings."""
+    """Print an event when it says something of the settings or of this machine."""
     from hmt_service.core.types import EventKind
 
-    if event.kind is EventKind.PRESET_DOUBTED:
+    if event.kind in (EventKind.PRESET_DOUBTED, EventKind.OVER_BUDGET):
         text = f"warning: {event.message}"
         console.print(text, style="yellow", soft_wrap=True, markup=False, highlight=False)
     elif event.kind is EventKind.PRESET_CONFIRMED:

@@ -26,6 +26,7 @@ from hmt_service.core.types import (
 if TYPE_CHECKING:
     from hmt_service.core.hypotheses import Hypothesis, ParticleLayer
     from hmt_service.core.transition import Successor
+    from hmt_service.core.visits import Visits
 
 # Beliefs that differ by no more than this are one that lasts.
 _EQUAL = 1e-6
@@ -172,6 +173,14 @@ def recognised(visit: int, best: Hypothesis, stamp_s: float) -> Event:
     numbers = {"hypothesis": float(best.hypothesis), "visit": float(visit), "area": float(area)}
     message = f"area {visit} is area {area}: what was seen is known"
     return Event(EventKind.ACCEPTED, stamp_s, message, numbers)
+
+
+def over_budget(visits: Visits, failure: str, stamp_s: float) -> Event:
+    """Return that more is in memory than may be."""
+    usage = visits.usage
+    held, shelved = (0, 0) if usage is None else (usage.held_bytes, usage.shelf_bytes)
+    numbers = {"held_bytes": float(held), "shelf_bytes": float(shelved)}
+    return Event(EventKind.OVER_BUDGET, stamp_s, failure, numbers)
 
 
 def lost(keyframe: Keyframe, failure: TrackingFailure, registration: Registration | None) -> Event:

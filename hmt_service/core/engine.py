@@ -108,6 +108,7 @@ class Engine:
         self._tracked: Counter[str] = Counter()
         self._weighed: dict[int, dict[int, float]] = {}
         self._doubted: list[int] = []
+        self._is_over_budget = False
         self._next_hypothesis = 0
         self._revision = 0
         self._finished_revision = 0
@@ -187,7 +188,16 @@ class Engine:
         self._revision += 1
         self._observation.learn(keyframe)
         doubts = self._plausibility.check(keyframe)
-        return self._audited((*doubts, *self._map(keyframe, tracking.registration)))
+        mapped = self._map(keyframe, tracking.registration)
+        return self._audited((*doubts, *mapped, *self._over_budget(keyframe.stamp_s)))
+
+    def _over_budget(self, stamp_s: float) -> tuple[Event, ...]:
+        """Say so once when more of the map is in memory than may be."""
+        was, failure = self._is_over_budget, self._visits.failure
+        self._is_over_budget = failure is not None
+        if failure is None or was:
+            return ()
+        return (audit.over_budget(self._visits, failure, stamp_s),)
 
     def misses(self, tracking: Tracking) -> bool:
         """Return whether a keyframe that a tracking is relative to never came.

@@ -135,6 +135,7 @@ class EventKind(StrEnum):
     PRESET_DOUBTED = "preset_doubted"
     PRESET_CONFIRMED = "preset_confirmed"
     NOT_SAVED = "not_saved"
+    OVER_BUDGET = "over_budget"
 
 
 @dataclass(frozen=True, slots=True)

@@ -32,7 +32,7 @@ from hmt_service.core.geometry import (
 )
 from hmt_service.core.submap import Visit, visit_of
 from hmt_service.core.types import NO_POINTS, Keyframe, TrackingFailure
-from hmt_service.errors import InvalidInput
+from hmt_service.errors import InvalidInput, Unavailable
 
 
 class Shelf(Protocol):
@@ -184,6 +184,7 @@ class Visits(Mapping[int, Visit]):
         self._sizes: dict[int, int] = {}
         self._used = set[int]()
         self._on_shelf = set[int]()
+        self._failure: str | None = None
         self._ready: dict[int, Visit] = {}
         for visit in visits:
             self.put(visit)
@@ -230,7 +231,10 @@ class Visits(Mapping[int, Visit]):
             self._used.add(visit.visit)
 
     def _make_room(self) -> None:
-        """Put what was not used for the longest time on the shelf, but for the last two visits."""
+        """Put what was not used for the longest time on the shelf, but for the last two visits.
+
+        What does not fit there stays: a budget is worth less than the map.
+        """
         if self._budget is None:
             return
         for visit in self._used:
@@ -239,10 +243,16 @@ class Visits(Mapping[int, Visit]):
         self._used = {last}
         for visit in list(self._sizes):
             if total <= self._budget.size_bytes:
-                return
+                break
             if visit != last and visit < len(self._visits) - 2:
-                total -= self._sizes[visit]
-                self._put_away(visit)
+                size = self._sizes[visit]
+                try:
+                    self._put_away(visit)
+                except Unavailable as error:
+                    self._failure = str(error)
+                    return
+                total -= size
+        self._failure = None
 
     def _put_away(self, visit: int) -> None:
         kept = self._visits[visit]
@@ -268,6 +278,11 @@ class Visits(Mapping[int, Visit]):
         if self._budget is None:
             return None
         return MemoryUsage(sum(self._sizes.values()), self._budget.shelf.size_bytes)
+
+    @property
+    def failure(self) -> str | None:
+        """Why more is in memory than the budget allows, if the shelf takes no more."""
+        return self._failure
 
     def keyframes(self, visit: int) -> int:
         """Return the number of keyframes of a visit."""

@@ -62,7 +62,7 @@ from hmt_service.service.ros2 import Ros2Input, encoding_under, input_of
 from hmt_service.service.senders import Senders
 
 _LOG = logging.getLogger(__name__)
-_WARNINGS = (EventKind.PRESET_DOUBTED, EventKind.NOT_SAVED)
+_WARNINGS = (EventKind.PRESET_DOUBTED, EventKind.NOT_SAVED, EventKind.OVER_BUDGET)
 _KEPT_EVENTS = 1000
 _KEPT_BELIEFS = 20_000
 _ANSWER_S = 8.0

@@ -129,6 +129,36 @@ def test_no_more_than_the_budget_is_in_memory_whatever_is_asked_for() -> None:
     assert not len(visits[1].points)
 
 
+def full(shelf: DiskShelf) -> int:
+    """Let a shelf take no more, as a full disk does, and return how much it could before."""
+    database = shelf._opened()
+    (most,) = database.execute("PRAGMA max_page_count").fetchone()
+    (pages,) = database.execute("PRAGMA page_count").fetchone()
+    database.execute(f"PRAGMA max_page_count = {pages}")
+    return int(most)
+
+
+def test_what_the_shelf_does_not_take_stays_in_memory() -> None:
+    whole = [*three(), visit_along(ROOM, PATH, visit=3), visit_along(ROOM, PATH, visit=4)]
+    shelf = DiskShelf()
+    visits = Visits(whole[:3], budget=tiny(1, shelf))
+    assert visits.failure is None
+    most = full(shelf)
+    for visit in whole[3:]:
+        visits.put(visit)
+    assert visits.failure is not None
+    assert "do not fit" in visits.failure
+    assert visits.usage is not None
+    assert visits.usage.held_bytes > sum(footprint_bytes(visit) for visit in whole[1:]) * 0.9
+    for number, before in enumerate(whole):
+        assert np.array_equal(visits[number].points, before.points)
+    # As soon as there is room again the budget holds.
+    shelf._opened().execute(f"PRAGMA max_page_count = {most}")
+    visits.put(visits[4])
+    assert visits.failure is None
+    assert visits.usage.held_bytes < sum(footprint_bytes(visit) for visit in whole[2:]) * 1.1
+
+
 def test_a_budget_that_is_too_small_says_so() -> None:
     with pytest.raises(InvalidInput, match="of 5 MB is too small"):
         MemoryBudget(5_000_000, DiskShelf())

@@ -10,11 +10,12 @@ import pytest
 
 from hmt_service.core.config import Config, Preset, load_config
 from hmt_service.core.engine import Engine
-from hmt_service.core.types import MapMethod, Reading
+from hmt_service.core.types import EventKind, MapMethod, Reading
 from hmt_service.core.visits import MemoryBudget
 from hmt_service.io.carmen import read_carmen
 from hmt_service.io.map_file import write_map
 from hmt_service.io.map_store import MapStore
+from hmt_service.io.shelf import DiskShelf
 from hmt_service.runtime.offline import map_readings
 from hmt_service.sim.sensors import Laser2d
 from hmt_service.sim.simulation import Robot, simulate
@@ -74,6 +75,19 @@ def test_a_known_map_is_gone_on_with_from_the_shelf(tmp_path: Path) -> None:
         map_readings(later, load_config(), known=engine)
         outcomes.append(outcome(engine, tmp_path / "later.hmt"))
     assert outcomes[0] == outcomes[1]
+
+
+def test_a_map_that_the_disk_has_no_room_for_is_the_same_and_says_so(tmp_path: Path) -> None:
+    readings, file, shelf = office(400), tmp_path / "map.hmt", DiskShelf()
+    pages = 40
+    shelf._opened().execute(f"PRAGMA max_page_count = {pages}")
+    expected = outcome(map_readings(readings, load_config())[0], file)
+    engine = Engine(load_config(), budget=tiny(TINY, shelf))
+    assert outcome(map_readings(readings, load_config(), known=engine)[0], file) == expected
+    (event,) = [e for e in engine.audit.events if e.kind is EventKind.OVER_BUDGET]
+    assert "do not fit into the folder for temporary files" in event.message
+    assert event.numbers["held_bytes"] > TINY
+    assert 0 < event.numbers["shelf_bytes"] < 4096 * pages
 
 
 @pytest.mark.parametrize("budget_bytes", [1, 1_500_000])

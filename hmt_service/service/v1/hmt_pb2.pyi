@@ -26,6 +26,7 @@ class EventKind(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     EVENT_KIND_PRESET_DOUBTED: _ClassVar[EventKind]
     EVENT_KIND_PRESET_CONFIRMED: _ClassVar[EventKind]
     EVENT_KIND_NOT_SAVED: _ClassVar[EventKind]
+    EVENT_KIND_OVER_BUDGET: _ClassVar[EventKind]
 
 class DaemonState(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
@@ -56,6 +57,7 @@ EVENT_KIND_PROCESS_FAILED: EventKind
 EVENT_KIND_PRESET_DOUBTED: EventKind
 EVENT_KIND_PRESET_CONFIRMED: EventKind
 EVENT_KIND_NOT_SAVED: EventKind
+EVENT_KIND_OVER_BUDGET: EventKind
 DAEMON_STATE_UNSPECIFIED: DaemonState
 DAEMON_STATE_STARTING: DaemonState
 DAEMON_STATE_RUNNING: DaemonState
