@@ -18,7 +18,7 @@ from hmt_service.client.calls import Ask, Calls
 from hmt_service.client.connection import POLL_S, Connection, LoopWatch, Pressure
 from hmt_service.client.feed import Feed
 from hmt_service.core.types import Event, EventKind, HmtPose, OdometryReading, Posterior, Reading
-from hmt_service.errors import DeadlineExceeded, Unavailable
+from hmt_service.errors import AccessDenied, DeadlineExceeded, Unavailable
 from hmt_service.service.keys import Input, Keys, Topic
 from hmt_service.service.readings import encode_reading
 
@@ -261,11 +261,12 @@ class AsyncHmtClient:
 
         Raises:
             DeadlineExceeded: If it does not in time.
+            AccessDenied: If this client may not ask for the posterior.
         """
         async with self.posteriors_live() as posteriors:
             try:
                 before = await self.posterior()
-            except DeadlineExceeded:
+            except (AccessDenied, DeadlineExceeded):
                 raise
             except Unavailable:
                 before = None
@@ -297,7 +298,8 @@ class AsyncHmtClient:
         None while the connection lasts; it comes back by itself, but what is sent meanwhile is
         lost. What became of the others is in `status`: refused by reason, or in the map.
         """
-        return self._connected.lost_in(await self.status())
+        sent = self._connected.sent()
+        return self._connected.lost_of(sent, await self.status())
 
     def _live(self, topic: Topic, kind: type[T], capacity: int) -> AsyncLive[T]:
         return AsyncLive(self._connected, self._connected.subscribe(topic, kind, capacity))

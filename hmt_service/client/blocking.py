@@ -17,7 +17,7 @@ from hmt_service.client.calls import Ask, Calls
 from hmt_service.client.connection import POLL_S, Connection, LoopWatch, Pressure
 from hmt_service.client.feed import Feed
 from hmt_service.core.types import Event, EventKind, HmtPose, OdometryReading, Posterior, Reading
-from hmt_service.errors import DeadlineExceeded, Unavailable
+from hmt_service.errors import AccessDenied, DeadlineExceeded, Unavailable
 from hmt_service.service.keys import Input, Keys, Topic
 from hmt_service.service.readings import encode_reading
 
@@ -242,11 +242,12 @@ class HmtClient:
 
         Raises:
             DeadlineExceeded: If it does not in time.
+            AccessDenied: If this client may not ask for the posterior.
         """
         with self.posteriors_live() as posteriors:
             try:
                 before = self.posterior()
-            except DeadlineExceeded:
+            except (AccessDenied, DeadlineExceeded):
                 raise
             except Unavailable:
                 before = None
@@ -277,7 +278,8 @@ class HmtClient:
         None while the connection lasts; it comes back by itself, but what is sent meanwhile is
         lost. What became of the others is in `status`: refused by reason, or in the map.
         """
-        return self._connection.lost_in(self.status())
+        sent = self._connection.sent()
+        return self._connection.lost_of(sent, self.status())
 
     def publish_raw(self, name: Input, payload: bytes, encoding: str) -> None:
         """Send any payload as a scan or as odometry; waits while the network is behind.

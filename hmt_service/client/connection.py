@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import secrets
 import threading
-from collections.abc import Mapping
-from concurrent.futures import Future
+from collections.abc import Iterator, Mapping
+from concurrent.futures import Future, InvalidStateError
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Generic, TypeVar, cast
 
@@ -65,18 +66,12 @@ class Connection:
         self.keys = keys
         self.timeout_s = timeout_s
         self._session = open_session(endpoints)
-        # Asked now: a question that is not answered ends where nobody may wait for another answer.
-        liveliness = self._session.liveliness()
-        tokens = liveliness.get(keys.liveliness, timeout=waiting_s)
-        self._is_served = any(reply.ok is not None for reply in tokens)
-        self._liveliness = liveliness.declare_subscriber(
-            keys.liveliness, zenoh.handlers.Callback(self._on_liveliness)
-        )
         self._publishers: dict[Input, zenoh.Publisher] = {}
         self._sender = 1 + secrets.randbelow(2**64 - 1)
         self._sent = dict.fromkeys(Input, 0)
         self._feeds: list[tuple[Feed[object], zenoh.Subscriber[None]]] = []
         self._lock = threading.Lock()
+        self._publishing = threading.Lock()
 
     def close(self) -> None:
         """End all feeds, and disconnect."""
@@ -109,18 +104,26 @@ class Connection:
         Raises:
             Unavailable: If nobody takes it.
         """
-        with self._lock:
+        # Until a daemon is there the first reading waits, and with it nothing but readings.
+        with self._publishing:
             if name not in self._publishers:
                 self._publishers[name] = self._publisher(self.keys.input(name))
+        with self._lock:
             number = self._sent[name]
             self._sent[name] = number + 1
         origin = encode_origin(self._sender, number)
-        self._publishers[name].put(payload, encoding=encoding, attachment=origin)
+        with _open(self.endpoint):
+            self._publishers[name].put(payload, encoding=encoding, attachment=origin)
 
-    def lost_in(self, status: Status) -> Mapping[Input, int]:
-        """Return how many of the readings sent so far had not arrived when this was said."""
+    def sent(self) -> Mapping[Input, int]:
+        """Return how many readings were sent until now."""
+        with self._lock:
+            return dict(self._sent)
+
+    def lost_of(self, sent: Mapping[Input, int], status: Status) -> Mapping[Input, int]:
+        """Return how many of the readings sent before had not arrived when this was said."""
         received = {c.input: c.received for c in status.senders if c.sender == self._sender}
-        return {name: sent - received.get(name, 0) for name, sent in self._sent.items()}
+        return {name: max(0, count - received.get(name, 0)) for name, count in sent.items()}
 
     def subscribe(self, topic: Topic, kind: type[T], capacity: int) -> Feed[T]:
         """Return what is published from now on."""
@@ -140,7 +143,8 @@ class Connection:
                 feed.put(error)
 
         key = self.keys.topic(topic)
-        subscriber = self._session.declare_subscriber(key, zenoh.handlers.Callback(on_sample))
+        with _open(self.endpoint):
+            subscriber = self._session.declare_subscriber(key, zenoh.handlers.Callback(on_sample))
         return self._keep(feed, subscriber)
 
     def watch_daemon(self) -> Feed[bool]:
@@ -150,9 +154,10 @@ class Connection:
         def on_sample(sample: zenoh.Sample) -> None:
             feed.put(sample.kind == zenoh.SampleKind.PUT)
 
-        subscriber = self._session.liveliness().declare_subscriber(
-            self.keys.liveliness, zenoh.handlers.Callback(on_sample), history=True
-        )
+        with _open(self.endpoint):
+            subscriber = self._session.liveliness().declare_subscriber(
+                self.keys.liveliness, zenoh.handlers.Callback(on_sample), history=True
+            )
         return self._keep(feed, subscriber)
 
     def unsubscribe(self, feed: Feed[T]) -> None:
@@ -164,15 +169,16 @@ class Connection:
         for subscriber in ended:
             subscriber.undeclare()
 
-    def nobody(self, key: str) -> Unavailable:
-        """Return the error that nobody is there, or not for this client."""
+    def unanswered(self, key: str) -> Unavailable:
+        """Ask why there is no answer, and return it: nobody is there, or not for this client."""
         name = f"daemon of site {self.keys.site}, robot {self.keys.robot}"
-        if self._is_served:
-            return AccessDenied(f"the {name} is at {self.endpoint}, and {key} is not granted here")
+        with _open(self.endpoint):
+            liveliness = self._session.liveliness()
+            tokens = liveliness.get(self.keys.liveliness, timeout=_MOST_CONNECTING_S)
+            if any(reply.ok is not None for reply in tokens):
+                where = f"the {name} is at {self.endpoint}"
+                return AccessDenied(f"{where}, and {key} is not granted here")
         return Unavailable(f"nobody answers {key} at {self.endpoint}: no {name}")
-
-    def _on_liveliness(self, sample: zenoh.Sample) -> None:
-        self._is_served = sample.kind == zenoh.SampleKind.PUT
 
     def _keep(self, feed: Feed[T], subscriber: zenoh.Subscriber[None]) -> Feed[T]:
         with self._lock:
@@ -180,11 +186,12 @@ class Connection:
         return feed
 
     def _publisher(self, key: str) -> zenoh.Publisher:
-        publisher = self._session.declare_publisher(
-            key,
-            congestion_control=zenoh.CongestionControl.BLOCK,
-            reliability=zenoh.Reliability.RELIABLE,
-        )
+        with _open(self.endpoint):
+            publisher = self._session.declare_publisher(
+                key,
+                congestion_control=zenoh.CongestionControl.BLOCK,
+                reliability=zenoh.Reliability.RELIABLE,
+            )
         # Before the daemon's subscription is known here, samples would go nowhere.
         is_matched = threading.Event()
         listener = publisher.declare_matching_listener(lambda _: is_matched.set())
@@ -193,8 +200,21 @@ class Connection:
         is_there = status.matching or is_matched.wait(self.timeout_s)
         listener.undeclare()
         if not is_there:
-            raise self.nobody(key)
+            raise self.unanswered(key)
         return publisher
+
+
+@contextmanager
+def _open(endpoint: str) -> Iterator[None]:
+    """Say of a session that is closed that it is.
+
+    Raises:
+        Unavailable: If it is.
+    """
+    try:
+        yield
+    except zenoh.ZError as error:
+        raise Unavailable(f"the connection to {endpoint} is closed: {error}") from error
 
 
 class _Exchange(Generic[T]):
@@ -227,20 +247,28 @@ class _Exchange(Generic[T]):
 
     def end(self) -> None:
         """Give the answer, or the error: no more replies come."""
+        if self._parts or self._error is not None:
+            self._conclude()
+        else:
+            # Why not is asked, for which Zenoh's own thread must not wait.
+            threading.Thread(target=self._conclude, name="unanswered", daemon=True).start()
+
+    def _conclude(self) -> None:
         try:
             self.future.set_result(self._ask.complete(self._value()))
         except Exception as error:  # noqa: BLE001 - whoever waits must learn it
             self.fail(error)
 
     def fail(self, error: Exception) -> None:
-        """Give an error instead of an answer."""
-        self.future.set_exception(error)
+        """Give an error instead of an answer, unless there is one already."""
+        with suppress(InvalidStateError):
+            self.future.set_exception(error)
 
     def _value(self) -> T:
         if self._error is not None:
             raise self._error
         if not self._parts:
-            raise self._connection.nobody(self._ask.key)
+            raise self._connection.unanswered(self._ask.key)
         if len(self._parts) < self._count:
             raise Unavailable(
                 f"{len(self._parts)} of {self._count} parts of the answer to {self._ask.key} "

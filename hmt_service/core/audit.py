@@ -121,7 +121,8 @@ def branched(parent: Hypothesis, child: Hypothesis, successor: Successor, stamp_
         stamp_s: Sensor time.
     """
     current = child.current
-    overlap, log_factor = successor.overlap, successor.log_factor
+    # With what new areas gain by those that they look like.
+    overlap, log_factor = successor.overlap, child.log_weight - parent.log_weight
     place = "a new area" if current.area_from_visit is None else f"area {current.area} again"
     if current.area_from_visit is None and overlap > 0.0:
         place = "a new area that sees a known one"

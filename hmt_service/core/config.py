@@ -162,11 +162,14 @@ class TransitionConfig(Section):
     outside_share: float = Field(default=0.1, gt=0.0, lt=1.0)
     """Prior probability that a robot that wakes up is at a place that its map does not know."""
     carried_share: float = Field(default=0.003, gt=0.0, lt=1.0)
-    """Prior probability that a robot whose scans do not fit any more has been carried elsewhere."""
+    """Prior probability that a robot whose scans do not fit any more has been carried elsewhere: of
+    some 20 losses of track in 5,000 scans of a `long` world none was, and few robots ever are."""
     max_carried_areas: int = Field(default=32, ge=1)
     """Most known areas that it may have been carried to: the nearest."""
     look_alike_share: float = Field(default=0.3, ge=0.0, lt=1.0)
-    """Prior probability that a place that is new looks like one that is known."""
+    """Prior probability that a place that is new looks like one that is known: 9 of 40 do in a
+    `long` world, 4 of 14 in a warehouse, all 7 in twin buildings, none of 12 in recorded
+    laboratories (explained better by what is out of sight than by the background)."""
     prior_samples: int = Field(default=256, ge=16)
     """Samples for the prior mass outside all known areas."""
 

@@ -382,19 +382,23 @@ class Engine:
         self, visit: Visit, arc: Factor, stamp_s: float
     ) -> tuple[list[Hypothesis], list[Event]]:
         """Return one hypothesis per hypothesis and place that the visit may be to, Eq. (6)."""
-        expanded, branched = [], []
         known = self._particles.hypotheses
-        found = [self._transition.successors(h, visit, arc, self._visits) for h in known]
-        for hypothesis, places in zip(known, found, strict=True):
-            for successor in places.successors:
+        places = [self._transition.successors(h, visit, arc, self._visits) for h in known]
+        parents, successors, expanded = [], [], []
+        for hypothesis, each in zip(known, places, strict=True):
+            for successor in each.successors:
                 # One successor is no branch: what was believed goes on.
-                is_branch = len(places.successors) > 1
+                is_branch = len(each.successors) > 1
                 identifier = self._new_identifier() if is_branch else hypothesis.hypothesis
-                child = _entered(hypothesis, visit.visit, arc, successor, identifier)
-                expanded.append(child)
-                if is_branch:
-                    branched.append(audit.branched(hypothesis, child, successor, stamp_s))
-        return _resembling(expanded, _log_resemblance(known, found)), branched
+                parents.append(hypothesis)
+                successors.append(successor)
+                expanded.append(_entered(hypothesis, visit, arc, successor, identifier))
+        expanded = _resembling(expanded, _log_resemblance(known, places))
+        return expanded, [
+            audit.branched(parent, child, successor, stamp_s)
+            for parent, child, successor in zip(parents, expanded, successors, strict=True)
+            if child.hypothesis != parent.hypothesis
+        ]
 
     def _weigh(self, keyframe: Keyframe) -> tuple[Event, ...]:
         """Multiply the weights by the predictive likelihood of a keyframe, Eq. (12)."""
@@ -403,13 +407,7 @@ class Engine:
         hypotheses = self._particles.hypotheses
         news = self._open.news_of(len(self._open.keyframes) - 1)
         evidence = {h.hypothesis: self._evidence(h, news) for h in hypotheses}
-        if found := [h for h in hypotheses if h.is_found]:
-            # A new area that looks like a known one looks like each as probably as it is that one.
-            before = np.array([h.log_weight for h in found])
-            after = before + [evidence[h.hypothesis] for h in found]
-            like = float(np.logaddexp.reduce(after) - np.logaddexp.reduce(before))
-            unlike = [h for h in hypotheses if h.log_unlike is not None]
-            evidence |= {h.hypothesis: h.log_likelihood_of_like(like) for h in unlike}
+        evidence |= _like_found(hypotheses, evidence)
         self._weighed[keyframe.index] = evidence
         dropped = self._particles.reweight(lambda h: evidence[h.hypothesis])
         return audit.pruned(dropped, keyframe.stamp_s)
@@ -862,17 +860,20 @@ def _said_of(tracking: Tracking) -> list[str]:
 
 
 def _entered(
-    hypothesis: Hypothesis, visit: int, arc: Factor, successor: Successor, identifier: int
+    hypothesis: Hypothesis, visit: Visit, arc: Factor, successor: Successor, identifier: int
 ) -> Hypothesis:
     """Return a hypothesis that goes on with a visit where a successor says."""
     area, place, is_carried = successor.area, successor.area_from_visit, successor.is_carried
-    new = Assignment(visit, visit, None, is_carried)
+    new = Assignment(visit.visit, visit.visit, None, is_carried)
     log_weight = hypothesis.log_weight + successor.log_factor
     extended = partial(hypothesis.extended, arc=arc, hypothesis=identifier, log_weight=log_weight)
     if area is None or place is None:
-        return replace(extended(new), look_alike_share=successor.look_alike_share)
+        # Who is lost once more has not been found since.
+        is_found = hypothesis.is_found and visit.keyframes[0].failure is None
+        share = successor.look_alike_share
+        return replace(extended(new), is_found=is_found, look_alike_share=share)
     if area != hypothesis.current.area or successor.overlap >= SAME_AREA:
-        known = extended(Assignment(visit, area, place, is_carried))
+        known = extended(Assignment(visit.visit, area, place, is_carried))
         return replace(known, is_found=known.is_found or successor.is_found)
     # Who only sees into the area that he was in has left it.
     return extended(new).recognising(
@@ -889,24 +890,42 @@ def _is_recognised(
     hypotheses: Sequence[Hypothesis], hypothesis: Hypothesis, match: Successor
 ) -> bool:
     """Return whether there is a hypothesis already that another one has this place in the map."""
-    area, place = match.area, match.area_from_visit
-    assert area is not None, "new areas are not recognised"
-    assert place is not None, "known areas have a place"
+    area, place = _known_place(match)
     return any(h.has_recognised(hypothesis, area, place.mean) for h in hypotheses)
 
 
 def _recognised(hypothesis: Hypothesis, match: Successor, identifier: int) -> Hypothesis:
     """Return a hypothesis whose last visit is where a match says."""
-    assert match.area is not None, "new areas are not recognised"
-    assert match.area_from_visit is not None, "known areas have a place"
     return hypothesis.recognising(
-        match.area,
-        match.area_from_visit,
+        *_known_place(match),
         is_same_area=match.overlap >= SAME_AREA,
         is_found=match.is_found,
         hypothesis=identifier,
         log_weight=hypothesis.log_weight_of_unlike + match.log_factor,
     )
+
+
+def _known_place(match: Successor) -> tuple[int, GaussianPose]:
+    assert match.area is not None, "new areas are not recognised"
+    assert match.area_from_visit is not None, "known areas have a place"
+    return match.area, match.area_from_visit
+
+
+def _like_found(
+    hypotheses: Sequence[Hypothesis], evidence: Mapping[int, float]
+) -> dict[int, float]:
+    """Return what a keyframe says for new areas that look like known ones, against the background.
+
+    They look like each as probably as the robot was found there.
+    """
+    found = [h for h in hypotheses if h.is_found]
+    if not found:
+        return {}
+    before = np.array([h.log_weight for h in found])
+    after = before + [evidence[h.hypothesis] for h in found]
+    like = float(np.logaddexp.reduce(after) - np.logaddexp.reduce(before))
+    unlike = [h for h in hypotheses if h.log_unlike is not None]
+    return {h.hypothesis: h.log_likelihood_of_like(like) for h in unlike}
 
 
 def _resembling(
@@ -918,16 +937,16 @@ def _resembling(
     return [hypothesis.resembling(log_resemblance) for hypothesis in hypotheses]
 
 
-def _log_resemblance(hypotheses: Sequence[Hypothesis], found: Sequence[Places]) -> float | None:
+def _log_resemblance(hypotheses: Sequence[Hypothesis], places: Sequence[Places]) -> float | None:
     """Return how well a new visit is explained by what looks like it, if anybody knows.
 
     A wing that looks like another does so room after room: what those hypotheses expect that have
     found the robot by its looks is what it would look like, too.
     """
-    searched = (p.log_resemblance(p.successors) for p in found if p.is_searched)
+    searched = (p.log_resemblance(p.successors) for p in places if p.is_searched)
     told = [
-        (h.log_weight, np.logaddexp.reduce([s.log_factor for s in places.successors]))
-        for h, places in zip(hypotheses, found, strict=True)
+        (h.log_weight, np.logaddexp.reduce([s.log_factor for s in each.successors]))
+        for h, each in zip(hypotheses, places, strict=True)
         if h.is_found
     ]
     if not told:

@@ -194,7 +194,7 @@ class Hypothesis:
             area: The older area.
             area_from_visit: Where the visit is in it.
             is_same_area: Whether the visit was to that area, and not to one that sees into it.
-            is_found: Whether nothing but what it saw says so.
+            is_found: Whether nothing but what it saw says so, if that was not so before.
             hypothesis: Identifier of the successor.
             log_weight: Its log weight, not normalised.
         """
@@ -205,7 +205,13 @@ class Hypothesis:
             topology = topology.with_visit(assignment)
         sees = None if is_same_area else area
         return Hypothesis(
-            hypothesis, log_weight, topology, graph, self.unlikely_for, sees, is_found
+            hypothesis,
+            log_weight,
+            topology,
+            graph,
+            self.unlikely_for,
+            sees,
+            self.is_found or is_found,
         )
 
     def resembling(self, log_resemblance: float) -> Hypothesis:
@@ -219,7 +225,8 @@ class Hypothesis:
                 the places that it may look like that have not been thought of before, each times
                 its share of them.
         """
-        if self.current.area != self.current.visit or self.sees is not None:
+        # Who has been found compares known areas with new ones as anybody does.
+        if self.is_found or self.current.area != self.current.visit or self.sees is not None:
             return self
         log_plain, share = self.log_weight_of_unlike, self.look_alike_share
         log_unlike = log_plain + math.log1p(-share)
@@ -268,6 +275,15 @@ class Hypothesis:
         own, theirs = self.graph.poses(), other.graph.poses()
         largest = np.abs(own - theirs).max(axis=0)
         return bool(largest[:3, 3].max() <= _EQUAL_M and largest[:3, :3].max() <= _EQUAL_RAD)
+
+    def merged(self, other: Hypothesis) -> Hypothesis:
+        """Return this hypothesis with the mass of another one that is the same map, too."""
+        mass = float(np.logaddexp(self.log_weight, other.log_weight))
+        log_unlike = None
+        if self.log_unlike is not None and other.log_unlike is not None:
+            unlike = self.log_weight + self.log_unlike, other.log_weight + other.log_unlike
+            log_unlike = min(float(np.logaddexp(*unlike)) - mass, 0.0)
+        return replace(self, log_weight=mass, log_unlike=log_unlike)
 
     def has_recognised(self, other: Hypothesis, area: int, area_from_visit: Pose) -> bool:
         """Return whether this is another hypothesis but that it ties the last visit there."""
@@ -395,8 +411,7 @@ class ParticleLayer:
             if index is None:
                 kept.append(hypothesis)
                 continue
-            mass = np.logaddexp(kept[index].log_weight, hypothesis.log_weight)
-            kept[index] = replace(kept[index], log_weight=float(mass))
+            kept[index] = kept[index].merged(hypothesis)
             merged.append(hypothesis)
         self.replace(kept)
         return tuple(merged)

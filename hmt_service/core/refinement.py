@@ -80,7 +80,10 @@ class Refinement:
                 area, mode = max(ties, key=lambda tie: tie[1].overlap)
                 assignment = replace(assignment, area=area, area_from_visit=mode.target_from_visit)
         topology = hypothesis.topology.with_visit(assignment)
-        return replace(hypothesis, graph=graph, topology=topology)
+        # What is known now does not look like something else.
+        is_new = assignment.area == visit.visit
+        log_unlike = hypothesis.log_unlike if is_new else None
+        return replace(hypothesis, graph=graph, topology=topology, log_unlike=log_unlike)
 
     def _neighbours(self, hypothesis: Hypothesis, visit: Visit, visits: Visits) -> list[int]:
         """Return the founders of the areas near enough to overlap, that of the visit's own first.

@@ -77,7 +77,8 @@ class Places:
         """Return how well places explain the visit that were searched although nothing leads there.
 
         Args:
-            successors: Some of them; those that do not explain it well were not.
+            successors: Those that count; a place that was searched and is not among them is one
+                that does not explain the visit.
 
         Returns:
             Log of the sum of p(z | x) / p0(z), each times its share of all that were searched.
@@ -116,8 +117,8 @@ class _Question:
         return frozenset() if self.is_open else self.hypothesis.graph.part_of(self.known)
 
     @property
-    def is_near(self) -> bool:
-        """Whether it was carried into this part of the map, and not across a whole site."""
+    def is_carried_here(self) -> bool:
+        """Whether it was carried to this part of the map: from nearby, not across a whole site."""
         assignments = self.hypothesis.topology.assignments
         return self.is_carried or (bool(self.part) and assignments[min(self.part)].is_carried)
 
@@ -210,8 +211,8 @@ class Transition:
         new = outside * self._config.outside_share if where.is_open else outside
         found = self._found(where, new)
         matches = self._matches(visit, candidates, visits)
-        # What is new where all is known has changed, and looks like no other place for that. Of who
-        # does not know how he went the bound of his speed says too much already: far away is new.
+        # What is new where all is known has changed, and looks like no other place for that. Nor
+        # does it if the heading is unknown: a bound of the motion alone favours what is far away.
         is_new_space = outside > self._least_outside and (where.is_open or where.is_heading_known)
         share = self._config.look_alike_share if is_new_space else 0.0
         successor = Successor(None, None, 0.0, float(np.log(new)), look_alike_share=share)
@@ -320,7 +321,7 @@ class Transition:
         visits, share = where.visits, self._config.outside_share
         areas = [area for area in where.hypothesis.topology.areas if area not in where.part]
         most = self._config.max_carried_areas
-        if where.is_near and len(areas) > most:
+        if where.is_carried_here and len(areas) > most:
             # Each is searched in every heading.
             positions = where.hypothesis.graph.poses()[:, :3, 3]
             away_m = np.linalg.norm(positions[areas] - positions[where.known], axis=1)

@@ -177,7 +177,8 @@ def _store(serialization: Serialization) -> Typestore:
 def _laser_scan(message: LaserScan, rules: _Rules) -> Decoded:
     frame = _checked_frame(message.header, rules.frames.scan)
     stamp_s = _stamp(message.header)
-    ranges: FloatArray = message.ranges.astype(np.float64)
+    with np.errstate(invalid="ignore"):  # NaN that signals
+        ranges: FloatArray = message.ranges.astype(np.float64)
     dropped = wrong_beams(ranges)
     steps: FloatArray = np.arange(len(ranges), dtype=np.float64)
     check_angles(message.angle_min, message.angle_increment * (len(ranges) - 1))
@@ -293,13 +294,14 @@ def _sweep(times: npt.NDArray[Any], stamp_s: float) -> tuple[FloatArray | None, 
         return None, 0.0
     is_whole = times.dtype.kind in "iu"
     # NaN that signals.
-    with np.errstate(invalid="ignore"):
+    with np.errstate(invalid="ignore", over="ignore"):
         exact = times.astype(np.int64 if is_whole else np.float64)
         first, end = exact.min(), float(exact.max())
-    if not (np.isfinite(first) and np.isfinite(end)):
+        since_first = (exact - first).astype(np.float64)
+        took = since_first.max()
+    # From one end of the numbers to the other is farther than any of them is large.
+    if not (np.isfinite(first) and np.isfinite(end) and np.isfinite(took)) or took < 0.0:
         raise DefectError(Defect.BAD_GEOMETRY)
-    since_first = (exact - first).astype(np.float64)
-    took = since_first.max()
     end_s = end / NANOSECONDS if is_whole or abs(end) > _LARGEST_S else end
     late_s = end_s - stamp_s if end_s > _SINCE_EPOCH_S else end_s
     point_times = since_first / took if took > 0.0 else None

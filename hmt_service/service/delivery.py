@@ -2,7 +2,8 @@
 
 A large answer goes out in parts, from a thread of its own: a reply waits for the network, for up
 to five seconds where a client reads nothing at all (Zenoh then closes its connection), and neither
-the topology process nor other clients may wait with it.
+the topology process nor other clients may wait with it, unless one reads so slowly that 64 MB wait:
+then until its deadline.
 
 References:
     own.
@@ -74,6 +75,8 @@ class _Delivery:
         if self._is_begun and isinstance(result, Part):
             self._parts.put(result, len(result.wire.payload))
         elif self._is_begun and isinstance(result, HmtError):
+            # Its time is over: nobody wants the rest, and who waits for room need not any more.
+            self._parts.discard()
             self._parts.put_token(result)
 
     def _begin(self, result: Result) -> None:

@@ -223,6 +223,27 @@ def test_closing_a_client_ends_its_iterations(daemon: RunningDaemon) -> None:
     assert list(events) == []
 
 
+def test_a_client_that_is_closed_says_so(daemon: RunningDaemon, drive: Drive) -> None:
+    client = daemon.client()
+    client.close()
+    for use in (client.status, client.poses_live, lambda: client.publish(drive.next(1)[0])):
+        with pytest.raises(Unavailable, match="closed") as refused:
+            use()
+        assert refused.type is Unavailable
+
+
+def test_who_dies_while_he_is_asked_has_not_denied_access(tmp_path: Path) -> None:
+    with running_daemon(tmp_path) as daemon, daemon.client() as client:
+        for reading in readings(400):
+            client.publish(reading)
+        killer = threading.Timer(0.2, daemon.process.kill)
+        killer.start()
+        with pytest.raises(Unavailable) as refused:
+            client.finish()
+        assert refused.type is Unavailable
+        killer.join()
+
+
 def test_a_loop_and_an_event_are_waited_for(client: HmtClient, drive: Drive) -> None:
     with pytest.raises(DeadlineExceeded):
         client.wait_for_loop(timeout_s=0.05)

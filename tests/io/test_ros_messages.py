@@ -189,6 +189,11 @@ def test_a_return_at_no_time_is_wrong() -> None:
         assert decoded(ROS.cloud(rows(SOME, time=times))) is Defect.BAD_GEOMETRY
 
 
+def test_times_that_are_farther_apart_than_a_number_is_large_are_wrong() -> None:
+    times = np.array([-1.7e308, 0.0, 0.0, 1.7e308], "<f8")
+    assert decoded(ROS.cloud(rows(SOME, time=times))) is Defect.BAD_GEOMETRY
+
+
 @pytest.mark.parametrize(
     "changes",
     [
