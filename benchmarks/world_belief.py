@@ -34,7 +34,7 @@ from hmt_service.core.engine import Engine
 from hmt_service.core.geometry import FloatArray, Pose, identity, inverse
 from hmt_service.core.odometry import Odometry
 from hmt_service.core.stored import StoredMap
-from hmt_service.core.submap import visit_of
+from hmt_service.core.storing import restored_visits
 from hmt_service.core.types import (
     Event,
     EventKind,
@@ -314,12 +314,7 @@ def _placement(journey: Journey, reference_from_visit: FloatArray) -> Placement:
 
 def _greedy(stored: StoredMap, config: Config) -> FloatArray:
     """Return where a greedy chain puts the visits of a map, shape (V, 4, 4)."""
-    keyframes = stored.keyframes
-    visits = [
-        visit_of(v.visit, keyframes[v.first_keyframe : v.last_keyframe + 1], config)
-        for v in stored.visits
-    ]
-    return greedy_poses(visits, config)
+    return greedy_poses(tuple(restored_visits(stored, config, budget=None).values()), config)
 
 
 def _odometry_errors(stored: StoredMap, journey: Journey, *, is_planar: bool) -> Iterator[float]:

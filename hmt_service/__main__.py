@@ -1,4 +1,4 @@
-"""Entry point of `hmt`: the one place where the package's own errors become an exit code.
+"""Entry point of `hmt`: where the package's own errors become a line and an exit code.
 
 References: own.
 """
@@ -9,10 +9,7 @@ from rich.console import Console
 from rich.text import Text
 
 from hmt_service.cli.app import app
-from hmt_service.errors import HmtError
-
-BAD_INPUT = 2
-"""Exit code of every `HmtError`, the same as of a wrong option; a bug crashes."""
+from hmt_service.errors import BAD_INPUT, HmtError
 
 
 def main() -> None:

@@ -16,6 +16,9 @@ References: own.
 
 from __future__ import annotations
 
+BAD_INPUT = 2
+"""Exit code of `hmt` after every `HmtError`, the same as of a wrong option; a bug crashes."""
+
 
 class HmtError(Exception):
     """Base of everything that this package raises on purpose."""

@@ -16,11 +16,9 @@ from enum import StrEnum
 import typer
 
 from hmt_service.core.types import Event
-from hmt_service.errors import HmtError
+from hmt_service.errors import BAD_INPUT, HmtError
 
 _LOG = logging.getLogger(__name__)
-_BAD_INPUT = 2
-"""Exit code of every `HmtError`."""
 
 Say = Callable[[str, bool], None]
 """Tells one sentence of the command itself, and whether it is bad news."""
@@ -77,7 +75,7 @@ def logging_as(log_format: LogFormat) -> Iterator[Say]:
         yield lambda text, is_bad: _LOG.log(logging.ERROR if is_bad else logging.INFO, "%s", text)
     except HmtError as error:
         _LOG.error("%s", error)
-        raise typer.Exit(_BAD_INPUT) from error
+        raise typer.Exit(BAD_INPUT) from error
 
 
 def _log_text() -> Say:

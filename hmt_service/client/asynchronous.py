@@ -17,10 +17,10 @@ from typing import Any, Concatenate, Generic, ParamSpec, Self, TypeVar
 from hmt_service.client.calls import Ask, Calls
 from hmt_service.client.connection import POLL_S, Connection, LoopWatch, Pressure
 from hmt_service.client.feed import Feed
-from hmt_service.core.types import Event, EventKind, HmtPose, OdometryReading, Posterior, Reading
+from hmt_service.core.types import Event, EventKind, HmtPose, Posterior, Reading
 from hmt_service.errors import AccessDenied, DeadlineExceeded, Unavailable
 from hmt_service.service.keys import Input, Keys, Topic
-from hmt_service.service.readings import encode_reading
+from hmt_service.service.readings import encode_reading, name_of
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -287,7 +287,7 @@ class AsyncHmtClient:
         if self._pressure.is_due(len(message.payload)):
             while not self._pressure.has_room(await self.status()):
                 await asyncio.sleep(POLL_S)
-        name = Input.ODOMETRY if isinstance(reading, OdometryReading) else Input.SCAN
+        name = name_of(reading)
         # The network may take its time.
         await asyncio.to_thread(self._connected.put, name, message.payload, message.encoding)
         return len(message.payload)

@@ -16,10 +16,10 @@ from typing import Concatenate, Generic, ParamSpec, Self, TypeVar
 from hmt_service.client.calls import Ask, Calls
 from hmt_service.client.connection import POLL_S, Connection, LoopWatch, Pressure
 from hmt_service.client.feed import Feed
-from hmt_service.core.types import Event, EventKind, HmtPose, OdometryReading, Posterior, Reading
+from hmt_service.core.types import Event, EventKind, HmtPose, Posterior, Reading
 from hmt_service.errors import AccessDenied, DeadlineExceeded, Unavailable
 from hmt_service.service.keys import Input, Keys, Topic
-from hmt_service.service.readings import encode_reading
+from hmt_service.service.readings import encode_reading, name_of
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -268,7 +268,7 @@ class HmtClient:
         if self._pressure.is_due(len(message.payload)):
             while not self._pressure.has_room(self.status()):
                 time.sleep(POLL_S)
-        name = Input.ODOMETRY if isinstance(reading, OdometryReading) else Input.SCAN
+        name = name_of(reading)
         self._connection.put(name, message.payload, message.encoding)
         return len(message.payload)
 

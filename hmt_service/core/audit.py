@@ -26,7 +26,7 @@ from hmt_service.core.types import (
 if TYPE_CHECKING:
     from hmt_service.core.hypotheses import Hypothesis, ParticleLayer
     from hmt_service.core.transition import Successor
-    from hmt_service.core.visits import Visits
+    from hmt_service.core.visits import MemoryUsage
 
 # Beliefs that differ by no more than this are one that lasts.
 _EQUAL = 1e-6
@@ -176,11 +176,12 @@ def recognised(visit: int, best: Hypothesis, stamp_s: float) -> Event:
     return Event(EventKind.ACCEPTED, stamp_s, message, numbers)
 
 
-def over_budget(visits: Visits, failure: str, stamp_s: float) -> Event:
+def over_budget(usage: MemoryUsage, failure: str, stamp_s: float) -> Event:
     """Return that more is in memory than may be."""
-    usage = visits.usage
-    held, shelved = (0, 0) if usage is None else (usage.held_bytes, usage.shelf_bytes)
-    numbers = {"held_bytes": float(held), "shelf_bytes": float(shelved)}
+    numbers = {
+        "held_bytes": float(usage.held_bytes),
+        "shelf_bytes": float(usage.shelf_bytes),
+    }
     return Event(EventKind.OVER_BUDGET, stamp_s, failure, numbers)
 
 

@@ -195,9 +195,9 @@ class Engine:
         """Say so once when more of the map is in memory than may be."""
         was, failure = self._is_over_budget, self._visits.failure
         self._is_over_budget = failure is not None
-        if failure is None or was:
+        if failure is None or was or (usage := self._visits.usage) is None:
             return ()
-        return (audit.over_budget(self._visits, failure, stamp_s),)
+        return (audit.over_budget(usage, failure, stamp_s),)
 
     def misses(self, tracking: Tracking) -> bool:
         """Return whether a keyframe that a tracking is relative to never came.
@@ -714,12 +714,12 @@ class Engine:
             hypothesis=chosen.hypothesis,
             probability=probability,
             revision=self._revision,
-            is_smoothed=self._is_smoothed(chosen),
+            is_smoothed=self._smooth_poses_of(chosen) is not None,
             poses=self._placed_scans(chosen, self._scans.between(start_s, end_s)),
         )
 
-    def _is_smoothed(self, hypothesis: Hypothesis) -> bool:
-        return hypothesis is self._particles.best and self._smooth_poses() is not None
+    def _smooth_poses_of(self, hypothesis: Hypothesis) -> FloatArray | None:
+        return self._smooth_poses() if hypothesis is self._particles.best else None
 
     def _placed_scans(
         self, hypothesis: Hypothesis, scans: Sequence[StoredScan]
@@ -739,8 +739,8 @@ class Engine:
         self, hypothesis: Hypothesis, first: int, last: int
     ) -> tuple[int, FloatArray]:
         """Return the poses of at least these keyframes, and which is the first of them."""
-        smoothed = self._smooth_poses()
-        if smoothed is not None and self._is_smoothed(hypothesis):
+        smoothed = self._smooth_poses_of(hypothesis)
+        if smoothed is not None:
             return 0, smoothed
         # Only visits that are asked for: others may have to be read from the disk.
         starts = np.cumsum([0, *map(self._visits.keyframes, self._visits)])
@@ -921,9 +921,7 @@ def _like_found(
     found = [h for h in hypotheses if h.is_found]
     if not found:
         return {}
-    before = np.array([h.log_weight for h in found])
-    after = before + [evidence[h.hypothesis] for h in found]
-    like = float(np.logaddexp.reduce(after) - np.logaddexp.reduce(before))
+    like = _log_mean(found, [evidence[h.hypothesis] for h in found])
     unlike = [h for h in hypotheses if h.log_unlike is not None]
     return {h.hypothesis: h.log_likelihood_of_like(like) for h in unlike}
 
@@ -945,15 +943,20 @@ def _log_resemblance(hypotheses: Sequence[Hypothesis], places: Sequence[Places])
     """
     searched = (p.log_resemblance(p.successors) for p in places if p.is_searched)
     told = [
-        (h.log_weight, np.logaddexp.reduce([s.log_factor for s in each.successors]))
+        (h, float(np.logaddexp.reduce([s.log_factor for s in each.successors])))
         for h, each in zip(hypotheses, places, strict=True)
         if h.is_found
     ]
     if not told:
         return next(searched, None)
-    log_weights, explained = np.array(told).T
-    expected = np.logaddexp.reduce(log_weights + explained) - np.logaddexp.reduce(log_weights)
-    return max(float(expected), next(searched, -math.inf))
+    return max(_log_mean(*zip(*told, strict=True)), next(searched, -math.inf))
+
+
+def _log_mean(hypotheses: Sequence[Hypothesis], log_likelihoods: Sequence[float]) -> float:
+    """Return the log of the mean of likelihoods, one per hypothesis, each with its weight."""
+    log_weights = np.array([hypothesis.log_weight for hypothesis in hypotheses])
+    weighed = np.logaddexp.reduce(log_weights + log_likelihoods)
+    return float(weighed - np.logaddexp.reduce(log_weights))
 
 
 def _means(placed: GlobalMap) -> Mapping[int, Pose]:

@@ -205,6 +205,23 @@ def planar_scan(
     return Scan(stamp_s, points_in_body, body_from_sensor[:3, 3], times)
 
 
+def row_type(fields: Mapping[str, tuple[str | None, int]], step: int) -> np.dtype[np.void]:
+    """Return how one point of a cloud lies in its bytes.
+
+    Args:
+        fields: Type and offset, in bytes, of each value; None for a type that nobody knows.
+        step: Bytes from one point to the next.
+
+    Raises:
+        DefectError: If a value has no known type, or does not end within the point.
+    """
+    known = {name: (np.dtype(kind), offset) for name, (kind, offset) in fields.items() if kind}
+    if known.keys() != fields.keys() or any(o + k.itemsize > step for k, o in known.values()):
+        raise DefectError(Defect.BAD_GEOMETRY)
+    kinds, offsets = zip(*known.values(), strict=True)
+    return np.dtype({"names": [*known], "formats": kinds, "offsets": offsets, "itemsize": step})
+
+
 def ranges_of(points: FloatArray) -> tuple[FloatArray, dict[Defect, int]]:
     """Return the distance of each point of a cloud, and how many are wrong.
 

@@ -47,6 +47,7 @@ from hmt_service.io.decoding import (
     odometry_reading,
     planar_scan,
     ranges_of,
+    row_type,
     stamp_of,
     wrong_beams,
 )
@@ -245,28 +246,15 @@ ODOMETRY_SCHEMAS = frozenset(_ODOMETRY)
 def _rows(message: PointCloud) -> npt.NDArray[np.void]:
     """Return a cloud as a structured array, one row per point."""
     stride, fields = message.point_stride, {f.name: f for f in message.fields}
-    is_consistent = (
-        len(fields) == len(message.fields)
-        and len(fields.keys() & {"x", "y", "z"}) >= 2
-        and all(
-            f.type in _TYPES and f.offset + np.dtype(_TYPES[f.type]).itemsize <= stride
-            for f in message.fields
-        )
-        and len(message.data) % stride == 0
-    )
+    is_consistent = len(fields) == len(message.fields) and len(fields.keys() & {"x", "y", "z"}) >= 2
     if not is_consistent:
+        raise DefectError(Defect.BAD_GEOMETRY)
+    rows = row_type({f.name: (_TYPES.get(f.type), f.offset) for f in message.fields}, stride)
+    if len(message.data) % stride:
         raise DefectError(Defect.BAD_GEOMETRY)
     if not message.data:
         raise DefectError(Defect.EMPTY)
-    dtype = np.dtype(
-        {
-            "names": list(fields),
-            "formats": [_TYPES[f.type] for f in fields.values()],
-            "offsets": [f.offset for f in fields.values()],
-            "itemsize": stride,
-        }
-    )
-    return np.frombuffer(message.data, dtype=dtype)
+    return np.frombuffer(message.data, dtype=rows)
 
 
 def _names(rows: npt.NDArray[np.void]) -> tuple[str, ...]:

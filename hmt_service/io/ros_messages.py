@@ -40,6 +40,7 @@ from hmt_service.io.decoding import (
     odometry_reading,
     planar_scan,
     ranges_of,
+    row_type,
     stamp_of,
     wrong_beams,
 )
@@ -85,7 +86,7 @@ _SINCE_EPOCH_S = 1e8
 _LARGEST_S = 1e12
 """Larger times are ns."""
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
-_FLOATS = frozenset({"f4", "f8"})
+_FLOATS = (7, 8)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -241,8 +242,11 @@ _READERS: dict[RosType, Callable[[Any, _Rules], Decoded]] = {
 def _rows(message: PointCloud2) -> npt.NDArray[np.void]:
     """Return coordinates and times of a cloud as a structured array, one row per point."""
     width, height, step = message.width, message.height, message.point_step
+    order = ">" if message.is_bigendian else "<"
+    kinds = {number: f"{order}{kind}" for number, kind in _TYPES.items()}
+    floats = {kinds[number] for number in _FLOATS}
     fields = {
-        name: (_TYPES.get(f.datatype), f.offset)
+        name: (kinds.get(f.datatype), f.offset)
         for name in ("x", "y", "z", *_TIME_FIELDS)
         for f in message.fields
         if f.name == name
@@ -252,27 +256,15 @@ def _rows(message: PointCloud2) -> npt.NDArray[np.void]:
     is_consistent = (
         width * height > 0
         and fields.keys() >= {"x", "y", "z"}
-        and all(fields[axis][0] in _FLOATS for axis in "xyz")
-        and all(
-            kind is not None and offset + np.dtype(kind).itemsize <= step
-            for kind, offset in fields.values()
-        )
+        and all(fields[axis][0] in floats for axis in "xyz")
         and message.row_step >= width * step
         and (height - 1) * message.row_step + width * step <= len(message.data)
     )
     if not is_consistent:
         raise DefectError(Defect.BAD_GEOMETRY)
-    order = ">" if message.is_bigendian else "<"
-    dtype = np.dtype(
-        {
-            "names": list(fields),
-            "formats": [f"{order}{kind}" for kind, _ in fields.values()],
-            "offsets": [offset for _, offset in fields.values()],
-            "itemsize": step,
-        }
-    )
     data = np.ascontiguousarray(message.data)
-    rows = np.ndarray((height, width), dtype, data, strides=(message.row_step, step))
+    strides = message.row_step, step
+    rows = np.ndarray((height, width), row_type(fields, step), data, strides=strides)
     return rows.reshape(-1)
 
 

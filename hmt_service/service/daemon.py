@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, wait
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -23,7 +24,6 @@ from hmt_service.service.codec import encode
 from hmt_service.service.gateway import Gateway
 from hmt_service.service.intake import IntakeLimits
 from hmt_service.service.keys import Keys
-from hmt_service.service.metrics import metrics_server
 from hmt_service.service.reports import Status
 from hmt_service.service.ros2 import Ros2Input
 from hmt_service.service.session import Endpoints, open_session
@@ -136,7 +136,7 @@ class Daemon:
             pipeline.start(gateway)
             try:
                 gateway.open()
-                with metrics_server(settings.metrics_port, settings.keys, gateway.status):
+                with _metrics(settings, gateway.status):
                     on_open()
                     failure = self._serve(gateway, pipeline)
                     return self._stop(gateway, pipeline, failure)
@@ -186,6 +186,18 @@ def _finish(gateway: Gateway, pipeline: Pipeline, *, is_broken: bool) -> Finishe
             pipeline.discard()
         wait([finished], timeout=_POLL_S)
     return finished.result() if finished.done() else None
+
+
+def _metrics(
+    settings: DaemonSettings, status: Callable[[], Status]
+) -> AbstractContextManager[None]:
+    """Serve the metrics meanwhile, if somebody wants them."""
+    if settings.metrics_port is None:
+        return nullcontext()
+    # Half as long to load as Zenoh, and most daemons have no use for it.
+    from hmt_service.service.metrics import metrics_server
+
+    return metrics_server(settings.metrics_port, settings.keys, status)
 
 
 def _refuse_second(session: zenoh.Session, keys: Keys) -> None:

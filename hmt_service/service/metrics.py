@@ -26,20 +26,17 @@ _HOST = "127.0.0.1"
 
 
 @contextmanager
-def metrics_server(port: int | None, keys: Keys, status: Callable[[], Status]) -> Iterator[None]:
+def metrics_server(port: int, keys: Keys, status: Callable[[], Status]) -> Iterator[None]:
     """Serve metrics by HTTP on loopback meanwhile, each time as they are then.
 
     Args:
-        port: TCP port; None for not at all.
+        port: TCP port.
         keys: Names of the robot, which are labels of `hmt_info`.
         status: Returns what the metrics are made of, at once; called from other threads.
 
     Raises:
         Unavailable: If the port is taken.
     """
-    if port is None:
-        yield
-        return
     registry = CollectorRegistry()
     registry.register(StatusCollector(keys, status))
     try:

@@ -89,6 +89,11 @@ class ReadingDecoder:
             self._frames = Frames({scan_frame}, bodies, self._frames.body_from_sensor)
 
 
+def name_of(reading: Reading) -> Input:
+    """Return what a reading is sent as."""
+    return Input.SCAN if isinstance(reading, Scan) else Input.ODOMETRY
+
+
 def encode_reading(reading: Reading) -> Wire:
     """Return a reading as it is sent; what comes back is what `foxglove.encode` promises.
 

@@ -60,31 +60,33 @@ def is_local(endpoint: str) -> bool:
     protocol, address, _ = _parts(endpoint)
     if protocol in _LOCAL_PROTOCOLS:
         return True
-    host = address.rpartition(":")[0].strip("[]")
-    if host == "localhost":
-        return True
-    try:
-        ip = ipaddress.ip_address(host)
-    except ValueError:
-        return False
+    ip = _ip(address)
+    if ip is None:
+        return _host(address) == "localhost"
     mapped = ip.ipv4_mapped if isinstance(ip, ipaddress.IPv6Address) else None
     return (mapped or ip).is_loopback
 
 
 def _asks(endpoint: str, *, certificates: bool, users: bool) -> bool:
     protocol, address, settings = _parts(endpoint)
-    if _is_multicast(address):
+    ip = _ip(address)
+    if ip is not None and ip.is_multicast:
         return False
     own = [value for name, value in settings if name == _ENABLE_MTLS]
     has_certificates = all(value == "true" for value in own) if own else certificates
     return users or (protocol in _TLS_PROTOCOLS and has_certificates)
 
 
-def _is_multicast(address: str) -> bool:
+def _host(address: str) -> str:
+    return address.rpartition(":")[0].strip("[]")
+
+
+def _ip(address: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
+    """Return the number in an address; None where it is a name."""
     try:
-        return ipaddress.ip_address(address.rpartition(":")[0].strip("[]")).is_multicast
+        return ipaddress.ip_address(_host(address))
     except ValueError:
-        return False
+        return None
 
 
 def _parts(endpoint: str) -> tuple[str, str, list[tuple[str, str]]]:
