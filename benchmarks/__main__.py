@@ -57,6 +57,7 @@ class Name(StrEnum):
     SCALING = "scaling"
     LAPS = "laps"
     LATENCY = "latency"
+    OUTAGES = "outages"
 
 
 def _measure_in_module(name: Name, run: Run) -> Report:

@@ -12,12 +12,13 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import partial
+from itertools import count
 
 from hmt_service.client import HmtClient
-from hmt_service.core.types import HmtPose, Reading
+from hmt_service.core.types import HmtPose, Reading, Scan
 from hmt_service.errors import DeadlineExceeded, InvalidInput, Unavailable
 from hmt_service.service.codec import decode
 from hmt_service.service.keys import Keys, Topic
@@ -81,6 +82,35 @@ def send(endpoint: str, readings: Sequence[Reading], *, is_paced: bool) -> Sent:
             client.publish(reading)
         processed = client.finish().processed_scans
         return Sent(tuple(put_s), time.perf_counter() - started_s, processed)
+
+
+def send_forever(
+    endpoint: str,
+    readings: Sequence[Reading],
+    is_over: Callable[[], bool],
+    *,
+    later_s: float = 0.0,
+) -> int:
+    """Publish readings when their time has come, again and again, until told; return the scans.
+
+    Args:
+        endpoint: Where the daemon listens; it may be gone for a while.
+        readings: In the order of time.
+        is_over: Says when to stop.
+        later_s: What to add to their stamps.
+    """
+    scans, lap_s = 0, readings[-1].stamp_s - readings[0].stamp_s + 1.0
+    with HmtClient(endpoint, site=_SITE, robot=_ROBOT) as client:
+        started_s = time.perf_counter()
+        for lap in count():
+            for reading in readings:
+                due_s = reading.stamp_s - readings[0].stamp_s + lap * lap_s
+                time.sleep(max(0.0, started_s + due_s - time.perf_counter()))
+                if is_over():
+                    return scans
+                client.publish(replace(reading, stamp_s=later_s + due_s))
+                scans += isinstance(reading, Scan)
+    return scans
 
 
 @contextmanager

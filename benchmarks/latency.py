@@ -138,6 +138,12 @@ def steady(readings: Sequence[Reading], *, rate_hz: float) -> tuple[Reading, ...
     return tuple(result)
 
 
+def recorded_or_simulated(scans: int) -> tuple[str, Sequence[Reading], tuple[str, ...]]:
+    """Return the name of what is sent, its first scans, and what could not be used."""
+    source, read, skipped = _source()
+    return source, read(scans), skipped
+
+
 def _source() -> tuple[str, Callable[[int], Sequence[Reading]], tuple[str, ...]]:
     """Return the name of what is sent, how to get its first scans, and what could not be used."""
     path = recorded_file(f"{_LOG}.clf.bz2")

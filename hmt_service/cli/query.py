@@ -386,6 +386,7 @@ def _status_rows(answer: Status) -> dict[str, str]:
         rows[process.name] = (
             f"pid {process.pid}, {readiness}, {process.processed} processed in "
             f"{process.busy_s:.1f} s, {process.backlog} waiting"
+            + (f", restarted {process.restarts} times" if process.restarts else "")
         )
     return rows
 

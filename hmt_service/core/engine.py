@@ -125,11 +125,12 @@ class Engine:
         seed: int = 0,
         is_frozen: bool = False,
         budget: MemoryBudget | None = None,
+        first_of_session: int | None = None,
     ) -> Engine:
-        """Return an engine that goes on with a stored map, in a new session.
+        """Return an engine that goes on with a stored map, in a new session if not told otherwise.
 
-        The next tracking is the first of an odometry that knows nothing of the map: the robot may
-        be anywhere in it, or outside.
+        The next tracking is then the first of an odometry that knows nothing of the map: the robot
+        may be anywhere in it, or outside.
 
         Args:
             stored: The map, with at least one keyframe.
@@ -137,6 +138,8 @@ class Engine:
             is_frozen: Whether the areas stay where and what they are: the session only finds its
                 place in them, and of its visits there only the path is kept.
             budget: How much of the map may be in memory; None for all of it.
+            first_of_session: Keyframes that the map had when the session began that was
+                interrupted: the next tracking is the next of its odometry.
 
         Raises:
             InvalidInput: If the settings in the map are not of this version, or it is empty.
@@ -165,6 +168,9 @@ class Engine:
         engine._revision = engine._finished_revision = stored.revision
         engine._first_of_session = len(stored.keyframes)
         engine._frozen_visits = len(visits) if is_frozen else 0
+        if first_of_session is not None and first_of_session < engine._first_of_session:
+            engine._first_of_session = first_of_session
+            engine._recall()
         return engine
 
     # ------------------------------------------------------------------ from scans to hypotheses
@@ -404,23 +410,31 @@ class Engine:
         """Multiply the weights by the predictive likelihood of a keyframe, Eq. (12)."""
         if len(self._particles.hypotheses) == 1:
             return ()
-        hypotheses = self._particles.hypotheses
-        news = self._open.news_of(len(self._open.keyframes) - 1)
-        evidence = {h.hypothesis: self._evidence(h, news) for h in hypotheses}
-        evidence |= _like_found(hypotheses, evidence)
-        self._weighed[keyframe.index] = evidence
+        evidence = self._weighed[keyframe.index] = self._said(len(self._open.keyframes) - 1)
         dropped = self._particles.reweight(lambda h: evidence[h.hypothesis])
         return audit.pruned(dropped, keyframe.stamp_s)
 
-    def _evidence(self, hypothesis: Hypothesis, news: News) -> float:
-        """Return what the news say for a hypothesis, against the background."""
+    def _recall(self) -> None:
+        """Find out what the keyframes of the open visit said, which no file tells."""
+        if len(self._particles.hypotheses) > 1:
+            for number, keyframe in enumerate(self._open.keyframes):
+                self._weighed[keyframe.index] = self._said(number)
+
+    def _said(self, number: int) -> dict[int, float]:
+        """Return what a keyframe of the open visit says for each hypothesis."""
+        hypotheses, news = self._particles.hypotheses, self._open.news_of(number)
+        evidence = {h.hypothesis: self._evidence(h, news, number) for h in hypotheses}
+        return evidence | _like_found(hypotheses, evidence)
+
+    def _evidence(self, hypothesis: Hypothesis, news: News, number: int) -> float:
+        """Return what the news of a keyframe say for a hypothesis, against the background."""
         visit, area = self._open, hypothesis.current.area
         if area == visit.visit:
             if hypothesis.sees is None:
                 return 0.0
             area = hypothesis.sees
         area_from_visit = inverse(hypothesis.graph.pose(area)) @ hypothesis.graph.pose(visit.visit)
-        pose = area_from_visit @ visit.visit_from_keyframe[-1].mean
+        pose = area_from_visit @ visit.visit_from_keyframe[number].mean
         known = self._visits[area].known_from(pose[:3, 3])
         return news.share * self._observation.log_ratio(news.keyframe, known, pose)
 
@@ -496,6 +510,16 @@ class Engine:
     def keyframes(self) -> int:
         """Number of keyframes in the map."""
         return self._open.last_keyframe + 1 if self._visits else 0
+
+    @property
+    def scans(self) -> int:
+        """Number of scans in the map, of all sessions."""
+        return len(self._scans)
+
+    @property
+    def first_of_session(self) -> int:
+        """Number of keyframes that the map had when the session began."""
+        return self._first_of_session
 
     @property
     def memory_usage(self) -> MemoryUsage | None:

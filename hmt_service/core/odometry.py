@@ -8,6 +8,8 @@ References:
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -54,6 +56,8 @@ _LEAST_MOTION_SHARE = 0.2
 _DRAWN2 = 4.0
 # Of so many intervals between scans, the median is what a sweep takes.
 _INTERVALS = 15
+# What settings and keyframes tell.
+_REBUILT = frozenset({"_sensor", "_config", "_motion", "_covariance", "_window", "_map"})
 
 
 class Odometry:
@@ -95,6 +99,31 @@ class Odometry:
         self._registered_s = 0.0
         self._failures = 0
         compile_kernels(is_planar=config.sensor.is_planar)
+
+    @classmethod
+    def resumed(
+        cls, config: Config, memory: Mapping[str, Any], window: Sequence[Keyframe]
+    ) -> Odometry:
+        """Return an odometry that goes on where another one was.
+
+        Args:
+            config: Settings of all stages, as before.
+            memory: What the other one remembered.
+            window: Its latest keyframes, at least as many as a window has, or all.
+        """
+        odometry = cls(config)
+        for keyframe in window:
+            points = keyframe.points_in_body.astype(np.float64)
+            seen = SeenPoints.of_keyframe(points, keyframe.sensor_in_body, config)
+            is_lost = keyframe.failure is not None
+            odometry._move_window(keyframe.previous_from_body.mean, seen, is_lost=is_lost)
+        vars(odometry).update(memory)
+        return odometry
+
+    @property
+    def memory(self) -> Mapping[str, Any]:
+        """What is remembered beside the window; true until the next reading."""
+        return {name: value for name, value in vars(self).items() if name not in _REBUILT}
 
     def process(self, reading: Reading) -> Tracking | None:
         """Take one reading in time order.

@@ -108,6 +108,10 @@ class ScanLog:
         self._keyframes = array("i")
         self._tangents = array("f")
 
+    def __len__(self) -> int:
+        """Return the number of scans."""
+        return len(self._stamps_s)
+
     def append(self, stamp_s: float, keyframe_index: int, keyframe_from_body: Pose) -> None:
         """Add the next scan."""
         self._stamps_s.append(stamp_s)

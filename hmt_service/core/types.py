@@ -136,6 +136,7 @@ class EventKind(StrEnum):
     PRESET_CONFIRMED = "preset_confirmed"
     NOT_SAVED = "not_saved"
     OVER_BUDGET = "over_budget"
+    PROCESS_RESTARTED = "process_restarted"
 
 
 @dataclass(frozen=True, slots=True)

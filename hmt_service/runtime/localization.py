@@ -28,6 +28,13 @@ class Localizer:
         self._chain = certain(np.eye(4))
         self._pose: HmtPose | None = None
 
+    def forget(self) -> None:
+        """Begin anew: what the next tracking is relative to has nothing to do with those before."""
+        with self._lock:
+            self._keyframes.clear()
+            self._snapshot, self._tracking, self._pose = None, None, None
+            self._chain = certain(np.eye(4))
+
     def track(self, tracking: Tracking) -> None:
         """Take what the odometry says of the latest scan."""
         with self._lock:

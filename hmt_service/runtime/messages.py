@@ -51,6 +51,8 @@ class Ready:
 
     known: Mapped | None = None
     """The map that it goes on with, if it does."""
+    first_keyframe: int = 0
+    """Keyframes that the map had when the session began."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +80,8 @@ class Tracked:
     """Readings processed so far."""
     busy_s: float
     """Time spent on them, s of the wall clock."""
+    memory: Mapping[str, Any] | None = None
+    """What the odometry remembers, for one that has to go on in its place; not passed on."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +89,7 @@ class RunReport:
     """What the run has cost so far."""
 
     scans: int
-    """Scans in the map."""
+    """Scans that went into the map."""
     odometry_busy_s: float
     """Time that the odometry has worked, s of the wall clock."""
     topology_busy_s: float
@@ -109,6 +113,10 @@ class Mapped:
     """What happened to the map."""
     report: RunReport
     """What the run has cost so far."""
+    known_scans: int
+    """Scans in the map, of all sessions."""
+    stored_scans: int
+    """How many of them are in the map file, whatever happens now."""
     finished: Finished | None = None
     """Set in the answer to `Finish`."""
 
@@ -200,6 +208,8 @@ class ProcessStatus:
     """Readings (odometry) or scans (topology) processed."""
     busy_s: float
     """Time spent on them, s of the wall clock."""
+    restarts: int = 0
+    """How often it has taken the place of one that died."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -296,7 +306,14 @@ class Keeper(Protocol):
     def is_frozen(self) -> bool:
         """Whether it is only read."""
 
-    def engine(self, config: Config, *, seed: int, budget: MemoryBudget | None) -> Engine:
+    def engine(
+        self,
+        config: Config,
+        *,
+        seed: int,
+        budget: MemoryBudget | None,
+        first_of_session: int | None,
+    ) -> Engine:
         """Return an engine that goes on with the map in the file, or begins one."""
 
     def write(self, engine: Engine) -> None:

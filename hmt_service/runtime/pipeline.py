@@ -19,32 +19,35 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing.connection import wait
 from multiprocessing.context import SpawnProcess
 from typing import TYPE_CHECKING, Protocol
 
 from hmt_service.core.config import Config
-from hmt_service.core.types import Reading, Tracking
+from hmt_service.core.types import Keyframe, Reading, Tracking
 from hmt_service.errors import DeadlineExceeded, Unavailable
 from hmt_service.runtime.links import Link
 from hmt_service.runtime.messages import (
     Asked,
     Encode,
     Finish,
+    Finished,
     Keeper,
     Mapped,
     Part,
     ProcessFailure,
     ProcessName,
     ProcessStatus,
+    Ready,
     Request,
     Result,
-    RunReport,
     Save,
     Tracked,
     dump,
+    load,
 )
+from hmt_service.runtime.recovery import Session, TrackedBefore
 from hmt_service.runtime.workers import run_odometry, run_topology
 
 if TYPE_CHECKING:
@@ -56,7 +59,9 @@ _TRACKINGS_BYTES = 256_000_000
 """Trackings that wait for the topology: hours of keyframes: it never blocks the odometry."""
 _MAX_REQUESTS = 32
 """Requests that may wait for the topology."""
-_GRACE_S = 0.2
+_GRACE_S = 1.0
+_MOST_STILLBORN = 3
+"""Processes in a row that may die before they are ready; then another one would, too."""
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -69,6 +74,15 @@ class Listener(Protocol):
     def on_map(self, mapped: Mapped) -> None:
         """Take what the topology made of one scan, or of a `Finish`."""
 
+    def on_failure(self, failure: ProcessFailure, *, is_session_over: bool) -> None:
+        """Learn that another process takes the place of one that died.
+
+        If the session is over, the next tracking is the first one of a new odometry.
+        """
+
+    def on_recovery(self, name: ProcessName, outage_s: float) -> None:
+        """Learn that a process which took the place of one that died is as far as that was."""
+
 
 @dataclass(slots=True)
 class _Pending:
@@ -77,8 +91,21 @@ class _Pending:
     deadline_s: float
 
 
+@dataclass(slots=True)
+class _Child:
+    """One of the two stages: a process at a time, and what became of those before it."""
+
+    links: tuple[Link, ...]
+    process: SpawnProcess | None = None
+    restarts: int = 0
+    stillborn: int = 0
+    """Processes in a row that died before they were ready."""
+    died_s: float | None = None
+    """When the last one died, as long as the next one is not ready."""
+
+
 class Pipeline:
-    """Owner of both child processes and of the pipes to them."""
+    """Owner of both child processes and of the links to them."""
 
     def __init__(
         self,
@@ -103,65 +130,57 @@ class Pipeline:
             budget: How much of the map the topology process may have in memory; None for all.
         """
         self._config = config
-        self._seed = seed
-        self._save = save
-        self._keeper = keeper
-        self._budget = budget
-        self._encode = encode
+        self._for_topology = (config, seed, save, keeper, budget, encode)
         self._progress = Tracked(None, 0, 0.0)
+        self._window: deque[Keyframe] = deque(maxlen=config.odometry.window_keyframes)
+        self._session = Session()
         self._tracked_scans = 0
-        self._report = RunReport(0, 0.0, 0.0)
         self._pending: deque[_Pending] = deque()
         self._pending_lock = threading.Lock()
+        self._odometry = Link("odometry", limit_bytes=_READINGS_BYTES, receive=self._on_odometry)
+        self._topology = Link("topology", limit_bytes=_TRACKINGS_BYTES, receive=self._on_topology)
+        self._requests = Link("requests", limit_bytes=_READINGS_BYTES, receive=self._on_result)
+        self._children = {
+            ProcessName.ODOMETRY: _Child((self._odometry,)),
+            ProcessName.TOPOLOGY: _Child((self._topology, self._requests)),
+        }
 
     def start(self, listener: Listener) -> None:
         """Start both processes; work may be handed over before they are ready."""
         self._listener = listener
+        self._start(ProcessName.ODOMETRY, is_resumed=False)
+        self._start(ProcessName.TOPOLOGY, is_resumed=False)
+
+    def _start(self, name: ProcessName, *, is_resumed: bool) -> None:
+        """Start a process, which goes on where the one before it was, or begins a new session."""
+        target: Callable[..., None]
+        args: tuple[object, ...]
+        match name:
+            case ProcessName.ODOMETRY:
+                target, args = run_odometry, (self._config, self._tracked_before(is_resumed))
+            case _:
+                interrupted = self._session.interrupted if is_resumed else None
+                report = self._session.report
+                target, args = run_topology, (*self._for_topology, report, interrupted)
         context = multiprocessing.get_context("spawn")
-        odometry_end, for_odometry = context.Pipe()
-        topology_end, for_topology = context.Pipe()
-        requests_end, for_requests = context.Pipe()
-        self._processes: dict[ProcessName, SpawnProcess] = {
-            ProcessName.ODOMETRY: context.Process(
-                target=run_odometry, args=(for_odometry, self._config), name="hmt-odometry"
-            ),
-            ProcessName.TOPOLOGY: context.Process(
-                target=run_topology,
-                args=(
-                    for_topology,
-                    for_requests,
-                    self._config,
-                    self._seed,
-                    self._save,
-                    self._keeper,
-                    self._budget,
-                    self._encode,
-                ),
-                name="hmt-topology",
-            ),
-        }
+        child = self._children[name]
+        pipes = [context.Pipe() for _ in child.links]
+        theirs = [end for _, end in pipes]
+        process = context.Process(target=target, args=(*theirs, *args), name=f"hmt-{name}")
         with _one_thread_per_library():
-            for process in self._processes.values():
-                process.start()
-        # A child's death ends a pipe only when nobody else holds that end.
-        for connection in (for_odometry, for_topology, for_requests):
-            connection.close()
-        self._odometry = Link(
-            odometry_end, "odometry", limit_bytes=_READINGS_BYTES, receive=self._on_odometry
-        )
-        self._topology = Link(
-            topology_end, "topology", limit_bytes=_TRACKINGS_BYTES, receive=self._on_topology
-        )
-        self._requests = Link(
-            requests_end, "requests", limit_bytes=_READINGS_BYTES, receive=self._on_result
-        )
-        self._links = (
-            (ProcessName.ODOMETRY, self._odometry),
-            (ProcessName.TOPOLOGY, self._topology),
-            (ProcessName.TOPOLOGY, self._requests),
-        )
-        for _, link in self._links:
-            link.start()
+            process.start()
+        child.process = process
+        for link, (ours, end) in zip(child.links, pipes, strict=True):
+            # A child's death ends a pipe only when nobody else holds that end.
+            end.close()
+            link.connect(ours)
+
+    def _tracked_before(self, is_resumed: bool) -> TrackedBefore:
+        progress = self._progress
+        if not is_resumed:
+            return TrackedBefore(processed=progress.processed, busy_s=progress.busy_s)
+        window = tuple(self._window)
+        return TrackedBefore(progress.memory, window, progress.processed, progress.busy_s)
 
     @property
     def is_ready(self) -> bool:
@@ -175,11 +194,12 @@ class Pipeline:
 
     def is_alive(self, name: ProcessName) -> bool:
         """Whether a child runs."""
-        return self._processes[name].is_alive()
+        process = self._children[name].process
+        return process is not None and process.is_alive()
 
     def status(self) -> tuple[ProcessStatus, ...]:
         """Return what both processes are doing."""
-        progress, report = self._progress, self._report
+        progress, report = self._progress, self._session.report
         return (
             self._status(ProcessName.ODOMETRY, self._odometry, progress.processed, progress.busy_s),
             self._status(
@@ -239,17 +259,87 @@ class Pipeline:
         for pending in late:
             self._answer(pending, DeadlineExceeded("no answer of the topology process in time"))
 
-    def failure(self, timeout_s: float) -> ProcessFailure | None:
-        """Wait until a child ends, and return which and how; None after `timeout_s`."""
-        sentinels = [process.sentinel for process in self._processes.values()]
-        is_over = bool(wait(sentinels, timeout_s))
-        for name, link in self._links:
-            process = self._processes[name]
-            if is_over or link.is_broken:
+    def watch(self, timeout_s: float) -> ProcessFailure | None:
+        """Wait until a process ends, and put another one in its place; at most `timeout_s`.
+
+        Returns:
+            What is wrong if that is of no use any more; None otherwise.
+        """
+        processes = [child.process for child in self._children.values() if child.process]
+        is_over = bool(wait([process.sentinel for process in processes], timeout_s))
+        for name, child in self._children.items():
+            process = child.process
+            if process is None:
+                continue
+            is_broken = any(link.is_broken for link in child.links)
+            if is_over or is_broken:
                 process.join(_GRACE_S)  # a pipe ends a moment before its process
-            if not process.is_alive() or link.is_broken:
-                return ProcessFailure(name, process.pid or 0, _reason(process.exitcode))
+            if process.is_alive() and not is_broken:
+                continue
+            failure = ProcessFailure(name, process.pid or 0, _reason(process.exitcode))
+            if not self._replace(name, failure):
+                return failure
         return None
+
+    def _replace(self, name: ProcessName, failure: ProcessFailure) -> bool:
+        """Start a process in the place of one that died; return whether that makes sense."""
+        child = self._children[name]
+        child.stillborn = 0 if child.links[0].is_ready else child.stillborn + 1
+        child.died_s = child.died_s or time.monotonic()
+        self._bury(name)
+        if child.stillborn >= _MOST_STILLBORN:
+            for link in child.links:
+                link.abandon()
+            return False
+        fatal = child.links[0].take_fatal()
+        if fatal is not None:
+            reason = f"{failure.reason} as the one before, of the same message, which is left out"
+            failure = replace(failure, reason=reason)
+        is_topology = name is ProcessName.TOPOLOGY
+        # Who is killed while it starts has tried nothing yet; twice, and what it is to go on with
+        # may be the reason.
+        is_over = child.stillborn > 1 or (
+            is_topology and (fatal is not None or self._session.interrupted is None)
+        )
+        if is_over:
+            self._end_session()
+        self._listener.on_failure(failure, is_session_over=is_over)
+        if is_topology and fatal is not None and isinstance(message := load(fatal), Finish):
+            self._fail(message, failure)
+        for each in self._children:
+            if each is name or is_over:
+                self._start(each, is_resumed=not is_over)
+        child.restarts += 1
+        return True
+
+    def _bury(self, name: ProcessName) -> None:
+        """Make sure that a process is gone, and answer those who wait for it alone."""
+        child = self._children[name]
+        if child.process is not None:
+            child.process.kill()
+            child.process.join()
+        for link in child.links:
+            link.disconnect()
+        if name is ProcessName.TOPOLOGY:
+            with self._pending_lock:
+                lost = [self._pending.popleft() for _ in range(self._requests.take_unanswered())]
+            for one in lost:
+                self._answer(one, Unavailable("the topology process died while it worked on this"))
+
+    def _end_session(self) -> None:
+        """Forget what only the processes that are gone could go on with."""
+        self._bury(ProcessName.TOPOLOGY)
+        self._topology.discard_all()  # who waits for room there could not be buried
+        self._bury(ProcessName.ODOMETRY)
+        self._topology.discard_all()
+        self._window.clear()
+        self._progress = replace(self._progress, memory=None)
+        self._session = Session(report=self._session.report)
+
+    def _fail(self, finish: Finish, failure: ProcessFailure) -> None:
+        finished = Finished(finish.number, (), f"{failure} while it finished the map")
+        scans, stored = self._session.known_scans, self._session.stored_scans
+        self._listener.on_map(Mapped(None, (), self._session.report, scans, stored, finished))
 
     def discard(self) -> None:
         """Throw away what no process has begun with."""
@@ -259,38 +349,63 @@ class Pipeline:
     def stop(self, timeout_s: float) -> tuple[ProcessName, ...]:
         """End both processes, and return which ones had to be killed after `timeout_s`."""
         deadline_s = time.monotonic() + timeout_s
-        for _, link in self._links:
-            link.stop()
+        for child in self._children.values():
+            for link in child.links:
+                link.stop()
         killed = []
-        for name, process in self._processes.items():
-            process.join(max(0.0, deadline_s - time.monotonic()))
-            if process.is_alive():
-                process.kill()
-                process.join()
+        for name, child in self._children.items():
+            if child.process is None:
+                continue
+            child.process.join(max(0.0, deadline_s - time.monotonic()))
+            if child.process.is_alive():
+                child.process.kill()
+                child.process.join()
                 killed.append(name)
-        for _, link in self._links:
-            link.join()
+            for link in child.links:
+                link.disconnect()
         with self._pending_lock:
             pending = list(self._pending)
         for one in pending:
             self._answer(one, Unavailable("the daemon is stopping"))
         return tuple(killed)
 
-    def _on_odometry(self, message: Tracked | Finish, data: bytes) -> None:
-        if isinstance(message, Finish):
+    def _on_odometry(self, message: Ready | Tracked | Finish, _: bytes, __: bytes) -> None:
+        if isinstance(message, Ready):
+            self._recovered(ProcessName.ODOMETRY)
+        elif isinstance(message, Finish):
             self._topology.put_token(message)
-            return
-        self._progress = message
-        if message.tracking is not None:
-            self._tracked_scans += 1
-            self._listener.on_tracking(message.tracking)
-            self._topology.put(data)
+        else:
+            self._progress = message
+            if message.tracking is not None:
+                self._tracked(message, message.tracking)
 
-    def _on_topology(self, message: Mapped, _: bytes) -> None:
-        self._report = message.report
+    def _tracked(self, message: Tracked, tracking: Tracking) -> None:
+        if tracking.keyframe is not None:
+            self._window.append(tracking.keyframe)
+        self._tracked_scans += 1
+        self._listener.on_tracking(tracking)
+        self._topology.put(dump(replace(message, memory=None)))
+
+    def _on_topology(self, message: Ready | Mapped, _: bytes, sent: bytes) -> None:
+        if isinstance(message, Ready):
+            self._session.first_keyframe = message.first_keyframe
+            self._recovered(ProcessName.TOPOLOGY)
+            if message.known is not None:
+                self._mapped(message.known, None)
+        else:
+            self._mapped(message, sent)
+
+    def _mapped(self, message: Mapped, told: bytes | None) -> None:
+        self._session.note(told, message)
         self._listener.on_map(message)
 
-    def _on_result(self, message: Result, _: bytes) -> None:
+    def _recovered(self, name: ProcessName) -> None:
+        child = self._children[name]
+        died_s, child.died_s = child.died_s, None
+        if died_s is not None:
+            self._listener.on_recovery(name, time.monotonic() - died_s)
+
+    def _on_result(self, message: Result, _: bytes, __: bytes) -> None:
         with self._pending_lock:
             is_over = not isinstance(message, Part) or message.is_last
             pending = self._pending.popleft() if is_over else self._pending[0]
@@ -307,8 +422,11 @@ class Pipeline:
     def _status(
         self, name: ProcessName, link: Link, processed: int, busy_s: float
     ) -> ProcessStatus:
-        pid = self._processes[name].pid or 0
-        return ProcessStatus(name, pid, link.is_ready, link.backlog, processed, busy_s)
+        child = self._children[name]
+        pid = 0 if child.process is None else child.process.pid or 0
+        return ProcessStatus(
+            name, pid, link.is_ready, link.backlog, processed, busy_s, child.restarts
+        )
 
 
 def _reason(exitcode: int | None) -> str:

@@ -20,7 +20,7 @@ from multiprocessing.connection import Connection, wait
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from hmt_service.core.config import Config
-from hmt_service.core.types import Event, EventKind
+from hmt_service.core.types import Event, EventKind, Snapshot
 from hmt_service.errors import (
     DaemonFailure,
     DeadlineExceeded,
@@ -56,10 +56,13 @@ from hmt_service.runtime.messages import (
 
 if TYPE_CHECKING:
     from hmt_service.core.visits import MemoryBudget
+    from hmt_service.runtime.recovery import Interrupted, TrackedBefore
 
 _LOG = logging.getLogger(__name__)
 # The map file is written this often, and takes no larger share of the time.
 _KEEP_S, _KEEP_SHARE = 1.0, 0.05
+# Scans of a robot that stands are no hurry.
+_MOST_UNSTORED = 1000
 _MOST_WHOLE_BYTES = 8_000_000
 """Largest answer in one piece: whoever passes it on copies it with everything else standing still
 (measured: 0.3 s for 100 MB)."""
@@ -67,13 +70,16 @@ _MOST_WHOLE_BYTES = 8_000_000
 T = TypeVar("T")
 
 
-def run_odometry(work: Connection, config: Config) -> None:
+def run_odometry(work: Connection, config: Config, before: TrackedBefore) -> None:
     """Turn readings into trackings until the pipe ends."""
     _leave_signals_to_parent()
     from hmt_service.core.odometry import Odometry
 
-    odometry = Odometry(config)
-    processed, busy_s = 0, 0.0
+    if before.memory is None:
+        odometry = Odometry(config)
+    else:
+        odometry = Odometry.resumed(config, before.memory, before.window)
+    processed, busy_s = before.processed, before.busy_s
     _send(work, Ready())
     for _, message in _received(work):
         if isinstance(message, Finish):
@@ -83,7 +89,7 @@ def run_odometry(work: Connection, config: Config) -> None:
         tracking = odometry.process(message)
         busy_s += time.perf_counter() - started
         processed += 1
-        _send(work, Tracked(tracking, processed, busy_s))
+        _send(work, Tracked(tracking, processed, busy_s, odometry.memory))
 
 
 def run_topology(
@@ -95,12 +101,14 @@ def run_topology(
     keeper: Keeper | None,
     budget: MemoryBudget | None,
     encode: Encode,
+    report: RunReport,
+    interrupted: Interrupted | None,
 ) -> None:
     """Turn trackings into the map until the pipes end, and answer requests between two scans."""
     _leave_signals_to_parent()
-    topology = _Topology(config, seed, save, keeper, budget, encode)
+    topology = _Topology(config, seed, save, keeper, budget, encode, report, interrupted)
     with closing(topology):
-        _send(work, Ready(topology.known()))
+        _send(work, topology.ready())
         for connection, message in _received(requests, work, idle=topology.rest):
             if connection is requests:
                 for result in topology.answer(message):
@@ -122,26 +130,50 @@ class _Topology:
         keeper: Keeper | None,
         budget: MemoryBudget | None,
         encode: Encode,
+        report: RunReport,
+        interrupted: Interrupted | None,
     ) -> None:
         from hmt_service.core.engine import Engine
 
-        begin = Engine if keeper is None else keeper.engine
-        self._engine = begin(config, seed=seed, budget=budget)
+        if keeper is None:
+            self._engine = Engine(config, seed=seed, budget=budget)
+        else:
+            first = None if interrupted is None else interrupted.first_keyframe
+            self._engine = keeper.engine(config, seed=seed, budget=budget, first_of_session=first)
         self._save = save
         self._encode = encode
         self._keeper = None if keeper is None or keeper.is_frozen else keeper
         self._stored_keyframes = self._engine.keyframes
+        self._stored_scans = self._engine.scans
         self._kept_s = -math.inf
         self._pause_s = _KEEP_S
         self._untold: tuple[Event, ...] = ()
-        self._scans = 0
-        self._odometry_busy_s = 0.0
-        self._busy_s = 0.0
+        self._scans = report.scans
+        self._odometry_busy_s = report.odometry_busy_s
+        self._busy_s = report.topology_busy_s
+        if interrupted is not None:
+            self._replay(interrupted)
 
-    def known(self) -> Mapped | None:
-        """Return the map that is gone on with, if there is one."""
+    def _replay(self, interrupted: Interrupted) -> None:
+        """Take in what was in the map before, and is not in the file.
+
+        Raises:
+            DaemonFailure: If some of it is lost.
+        """
+        missing = interrupted.known_scans - self._engine.scans
+        kept = len(interrupted.journal)
+        if not 0 <= missing <= kept:
+            raise DaemonFailure(f"{missing} scans are not in the map file, {kept} are kept")
+        for data in interrupted.journal[kept - missing :]:
+            tracked: Tracked = load(data)
+            assert tracked.tracking is not None, "only scans are kept"
+            self._engine.process(tracked.tracking)
+
+    def ready(self) -> Ready:
+        """Return what is there to begin with."""
         snapshot = self._engine.snapshot()
-        return None if snapshot is None else Mapped(snapshot, (), self._report())
+        known = None if snapshot is None else self._mapped(snapshot, ())
+        return Ready(known, self._engine.first_of_session)
 
     def map(self, tracked: Tracked) -> Mapped:
         """Take one scan into the map, unless what it is relative to was thrown away before.
@@ -150,7 +182,7 @@ class _Topology:
         """
         assert tracked.tracking is not None, "the parent forwards scans only"
         if self._engine.misses(tracked.tracking):
-            return Mapped(None, (), self._report())
+            return self._mapped(None, ())
         started = time.perf_counter()
         events = self._engine.process(tracked.tracking)
         self._busy_s += time.perf_counter() - started
@@ -159,7 +191,7 @@ class _Topology:
         events = (*events, *self._untold, *self.keep())
         self._untold = ()
         has_changed = tracked.tracking.keyframe is not None or bool(events)
-        return Mapped(self._engine.snapshot() if has_changed else None, events, self._report())
+        return self._mapped(self._engine.snapshot() if has_changed else None, events)
 
     def rest(self) -> None:
         """Write the map file while nothing comes; what went wrong is told with the next answer."""
@@ -172,7 +204,7 @@ class _Topology:
             # Smoothing takes a while: what there is has been saved, should the daemon be stopped.
             more, finished = self._finished(finish.number, is_urgent=False)
             events = (*events, *more)
-        return Mapped(self._engine.snapshot(), events, self._report(), finished)
+        return self._mapped(self._engine.snapshot(), events, finished)
 
     def _finished(self, number: int, *, is_urgent: bool) -> tuple[tuple[Event, ...], Finished]:
         started = time.perf_counter()
@@ -242,7 +274,7 @@ class _Topology:
         # The map goes on in this file: nothing that fails with the others may keep it back.
         if self._keeper is not None and self._engine.keyframes > 0:
             self._keeper.write(self._engine)
-            self._stored_keyframes = self._engine.keyframes
+            self._note_stored()
             files = (str(self._keeper.path),)
         if self._save is not None:
             files = (*files, *self._save(self._engine, self._report()))
@@ -251,7 +283,10 @@ class _Topology:
     def keep(self) -> tuple[Event, ...]:
         """Write the map file if it lacks keyframes, but not all the time; say what went wrong."""
         keeper, started_s = self._keeper, time.monotonic()
-        if keeper is None or self._engine.keyframes == self._stored_keyframes:
+        unstored_scans = self._engine.scans - self._stored_scans
+        if self._engine.keyframes == self._stored_keyframes and unstored_scans < _MOST_UNSTORED:
+            return ()
+        if keeper is None or self._engine.keyframes == 0:
             return ()
         if started_s - self._kept_s < self._pause_s:
             return ()
@@ -259,7 +294,7 @@ class _Topology:
         self._kept_s = time.monotonic()
         self._pause_s = max(_KEEP_S, (self._kept_s - started_s) / _KEEP_SHARE)
         if failed is None:
-            self._stored_keyframes = self._engine.keyframes
+            self._note_stored()
             return ()
         keyframes, stored = float(self._engine.keyframes), float(self._stored_keyframes)
         numbers = {"keyframes": keyframes, "stored": stored}
@@ -272,8 +307,20 @@ class _Topology:
         if self._keeper is not None:
             self._keeper.close()
 
+    def _note_stored(self) -> None:
+        self._stored_keyframes, self._stored_scans = self._engine.keyframes, self._engine.scans
+
     def _report(self) -> RunReport:
         return RunReport(self._scans, self._odometry_busy_s, self._busy_s, self._stored_keyframes)
+
+    def _mapped(
+        self,
+        snapshot: Snapshot | None,
+        events: tuple[Event, ...],
+        finished: Finished | None = None,
+    ) -> Mapped:
+        scans, stored = self._engine.scans, self._stored_scans
+        return Mapped(snapshot, events, self._report(), scans, stored, finished)
 
 
 def _guarded(answer: Callable[[], T]) -> T | HmtError:

@@ -522,6 +522,7 @@ def _status_to_proto(status: Status) -> pb.Status:
                 backlog=process.backlog,
                 processed=process.processed,
                 busy_s=process.busy_s,
+                restarts=process.restarts,
             )
             for process in status.processes
         ],
@@ -574,6 +575,7 @@ def _status(message: pb.Status) -> Status:
                 backlog=process.backlog,
                 processed=process.processed,
                 busy_s=process.busy_s,
+                restarts=process.restarts,
             )
             for process in message.processes
         ),

@@ -74,7 +74,7 @@ class StopReport:
     reason: str
     """Who or what stopped it."""
     failure: ProcessFailure | None
-    """The process that died, if one did."""
+    """The process that could not be replaced, if there is one."""
     status: Status
     """Its last words."""
     finished: Finished | None
@@ -104,7 +104,7 @@ class Daemon:
         self._reason = self._reason or reason
 
     def run(self, *, on_open: Callable[[], None] = lambda: None) -> StopReport:
-        """Serve until asked to stop, or until a process dies.
+        """Serve until asked to stop, or until no process can take the place of one that died.
 
         Args:
             on_open: Called when input is taken.
@@ -145,7 +145,7 @@ class Daemon:
 
     def _serve(self, gateway: Gateway, pipeline: Pipeline) -> ProcessFailure | None:
         while self._reason is None:
-            failure = pipeline.failure(_TICK_S) or gateway.failure()
+            failure = pipeline.watch(_TICK_S) or gateway.failure()
             if failure is not None:
                 return failure
             gateway.tick()

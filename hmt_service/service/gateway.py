@@ -62,7 +62,12 @@ from hmt_service.service.ros2 import Ros2Input, encoding_under, input_of
 from hmt_service.service.senders import Senders
 
 _LOG = logging.getLogger(__name__)
-_WARNINGS = (EventKind.PRESET_DOUBTED, EventKind.NOT_SAVED, EventKind.OVER_BUDGET)
+_WARNINGS = (
+    EventKind.PRESET_DOUBTED,
+    EventKind.NOT_SAVED,
+    EventKind.OVER_BUDGET,
+    EventKind.PROCESS_FAILED,
+)
 _KEPT_EVENTS = 1000
 _KEPT_BELIEFS = 20_000
 _ANSWER_S = 8.0
@@ -248,6 +253,21 @@ class Gateway:
         self.publish(mapped.events)
         if mapped.finished is not None:
             self._finish_until(mapped.finished)
+
+    def on_failure(self, failure: ProcessFailure, *, is_session_over: bool) -> None:
+        """Tell what died, and what comes of it."""
+        consequence = "another one goes on where it was"
+        if is_session_over:
+            self._localizer.forget()
+            consequence = "a new session begins, with the map that was stored"
+        message = f"{failure}: {consequence}"
+        self.publish([Event(EventKind.PROCESS_FAILED, self.stamp_s, message)])
+
+    def on_recovery(self, name: ProcessName, outage_s: float) -> None:
+        """Tell that all is well again."""
+        message = f"process {name} works again after {outage_s:.1f} s"
+        numbers = {"outage_s": outage_s}
+        self.publish([Event(EventKind.PROCESS_RESTARTED, self.stamp_s, message, numbers)])
 
     def _finish_until(self, finished: Finished) -> None:
         # Earlier ones too: their tokens are lost when the odometry is.

@@ -33,13 +33,21 @@ class KeptMap:
         # Where the path is a link, the file that it leads to is written.
         self._store = MapStore(path)
 
-    def engine(self, config: Config, *, seed: int, budget: MemoryBudget | None = None) -> Engine:
+    def engine(
+        self,
+        config: Config,
+        *,
+        seed: int,
+        budget: MemoryBudget | None = None,
+        first_of_session: int | None = None,
+    ) -> Engine:
         """Return an engine that goes on with the map, or begins it.
 
         Args:
             config: Settings of a map that begins; a known map has its own.
             seed: Seed of all randomness.
             budget: How much of the map may be in memory; None for all of it.
+            first_of_session: As in `Engine.restored`.
 
         Raises:
             NotFound: If the map is frozen, and there is none.
@@ -50,7 +58,13 @@ class KeptMap:
 
         with self._store.reading() as stored:
             if stored is not None:
-                return Engine.restored(stored, seed=seed, is_frozen=self.is_frozen, budget=budget)
+                return Engine.restored(
+                    stored,
+                    seed=seed,
+                    is_frozen=self.is_frozen,
+                    budget=budget,
+                    first_of_session=first_of_session,
+                )
             if self.is_frozen:
                 raise NotFound(f"map file {self.path} does not exist")
             return Engine(config, seed=seed, budget=budget)

@@ -126,6 +126,12 @@ def _of_processes(status: Status) -> Iterator[Metric]:
         CounterMetricFamily("hmt_process_busy_seconds", "Time worked", None, ["process"]),
         {name: process.busy_s for name, process in processes.items()},
     )
+    yield _by_label(
+        CounterMetricFamily(
+            "hmt_process_restarts", "Times that it took the place of one", None, ["process"]
+        ),
+        {name: float(process.restarts) for name, process in processes.items()},
+    )
 
 
 def _of_map(status: Status) -> Iterator[Metric]:

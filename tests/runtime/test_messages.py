@@ -9,7 +9,7 @@ from hmt_service.runtime.messages import Mapped, RunReport, dump, load
 
 def test_events_with_read_only_numbers_pass_a_pipe() -> None:
     event = Event(EventKind.LOST, 1.5, "lost", MappingProxyType({"distance_m": 2.0}))
-    mapped = load(dump(Mapped(None, (event,), RunReport(1, 0.5, 0.25))))
+    mapped = load(dump(Mapped(None, (event,), RunReport(1, 0.5, 0.25), 1, 0)))
     assert mapped.events == (event,)
     assert mapped.report == RunReport(1, 0.5, 0.25)
 

@@ -1,9 +1,7 @@
 from __future__ import annotations
 
 import os
-import signal
 import threading
-import time
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -16,30 +14,22 @@ from hypothesis import strategies as st
 from hmt_service.core.config import Config, load_config
 from hmt_service.core.engine import Engine
 from hmt_service.core.odometry import Odometry
-from hmt_service.core.types import Event, GlobalMap, MapMethod, Reading, Scan, Tracking
-from hmt_service.errors import DaemonFailure, DeadlineExceeded, HmtError, NotFound, Unavailable
+from hmt_service.core.types import Event, GlobalMap, MapMethod, Scan
+from hmt_service.errors import DaemonFailure, DeadlineExceeded, NotFound, Unavailable
 from hmt_service.runtime.messages import (
-    Answer,
     CompareRequest,
     Finish,
     Finished,
-    Mapped,
     MapRequest,
-    Part,
-    ProcessName,
-    Request,
     Result,
     RunReport,
     SaveRequest,
     Wire,
-    dump,
-    load,
     parts_of,
 )
 from hmt_service.runtime.pipeline import Pipeline
 from tests.flat import SETTINGS, readings
-
-DEADLINE_S = 20.0
+from tests.runtime.harness import DEADLINE_S, Answers, Recorder, Running, encode
 
 
 def save_area_count(engine: Engine, report: RunReport) -> tuple[str, ...]:
@@ -61,87 +51,6 @@ def append_trajectory(log: Path, engine: Engine, _report: RunReport) -> tuple[st
 
 def stumble(_engine: Engine, _report: RunReport) -> tuple[str, ...]:
     raise ZeroDivisionError("a bug")
-
-
-class Recorder:
-    """Keeps what the pipeline tells."""
-
-    def __init__(self) -> None:
-        self.trackings: list[Tracking] = []
-        self.mapped: list[Mapped] = []
-        self.finished: list[Finished] = []
-        self._has_finished = threading.Event()
-
-    def on_tracking(self, tracking: Tracking) -> None:
-        self.trackings.append(tracking)
-
-    def on_map(self, mapped: Mapped) -> None:
-        self.mapped.append(mapped)
-        if mapped.finished is not None:
-            self.finished.append(mapped.finished)
-            self._has_finished.set()
-
-    def wait(self) -> Finished:
-        assert self._has_finished.wait(DEADLINE_S)
-        self._has_finished.clear()
-        return self.finished[-1]
-
-
-def encode(answer: Answer) -> Wire:
-    """Stand for the messages of the service."""
-    return Wire(dump(answer), type(answer).__name__)
-
-
-class Answers:
-    """Collects the one answer to a request, which may come in parts."""
-
-    def __init__(
-        self,
-        pipeline: Pipeline,
-        request: Request,
-        timeout_s: float = DEADLINE_S,
-        part_bytes: int | None = None,
-    ) -> None:
-        self.results: list[Answer | tuple[str, ...] | HmtError] = []
-        self.parts: list[Part] = []
-        self._is_there = threading.Event()
-        pipeline.request(request, self._take, timeout_s=timeout_s, part_bytes=part_bytes)
-
-    def _take(self, result: Result) -> None:
-        if not isinstance(result, Part):
-            self.results.append(result)
-        else:
-            self.parts.append(result)
-            if not result.is_last:
-                return
-            assert [part.number for part in self.parts] == list(range(result.count))
-            self.results.append(load(b"".join(part.wire.payload for part in self.parts)))
-        self._is_there.set()
-
-    def wait(self) -> Answer | tuple[str, ...] | HmtError:
-        assert self._is_there.wait(DEADLINE_S)
-        return self.results[0]
-
-
-class Running:
-    """A pipeline with both processes, its listener, and what it is fed."""
-
-    def __init__(self, pipeline: Pipeline, recorder: Recorder) -> None:
-        self.pipeline = pipeline
-        self.recorder = recorder
-        self._finishes = 0
-
-    def feed(self, sent: list[Reading]) -> None:
-        for reading in sent:
-            assert self.pipeline.submit(reading)
-
-    def finish(self) -> Finished:
-        self._finishes += 1
-        assert self.pipeline.finish(Finish(self._finishes))
-        return self.recorder.wait()
-
-    def pid(self, name: ProcessName) -> int:
-        return next(status.pid for status in self.pipeline.status() if status.name == name)
 
 
 @pytest.fixture
@@ -280,30 +189,6 @@ def test_too_many_questions_at_once_are_refused(running: Running) -> None:
     assert all("32 wait" in str(answer) or "keyframe" in str(answer) for answer in refused)
 
 
-@pytest.mark.parametrize("name", [ProcessName.ODOMETRY, ProcessName.TOPOLOGY])
-def test_a_killed_process_is_noticed_at_once_by_name_and_signal(
-    running: Running, name: ProcessName
-) -> None:
-    running.feed(readings(20))
-    assert running.pipeline.failure(0.0) is None
-    pid = running.pid(name)
-    os.kill(pid, signal.SIGKILL)
-    started_s = time.monotonic()
-    failure = running.pipeline.failure(DEADLINE_S)
-    assert time.monotonic() - started_s < 1.0
-    assert str(failure) == f"process {name} (pid {pid}) was killed by SIGKILL"
-
-
-def test_the_map_survives_the_odometry(running: Running) -> None:
-    running.feed(readings(20))
-    running.finish()
-    os.kill(running.pid(ProcessName.ODOMETRY), signal.SIGKILL)
-    assert running.pipeline.failure(DEADLINE_S) is not None
-    assert running.pipeline.is_alive(ProcessName.TOPOLOGY)
-    assert running.pipeline.finish_map(Finish(7))
-    assert running.recorder.wait() == Finished(7, ("1 areas of 20 scans",))
-
-
 @pytest.mark.parametrize(("is_urgent", "saves"), [(True, 1), (False, 2)])
 def test_the_map_is_saved_before_it_is_smoothed(
     config: Config, tmp_path: Path, is_urgent: bool, saves: int
@@ -320,12 +205,6 @@ def test_the_map_is_saved_before_it_is_smoothed(
     recorder.wait()
     assert log.read_text().splitlines() == ["60 poses"] * saves
     assert pipeline.stop(5.0) == ()
-
-
-def test_submit_returns_false_instead_of_waiting_for_a_dead_process(running: Running) -> None:
-    sent = readings(3000)
-    os.kill(running.pid(ProcessName.ODOMETRY), signal.SIGKILL)
-    assert not all(running.pipeline.submit(reading) for reading in sent)
 
 
 def test_a_map_that_cannot_be_saved_is_reported_and_kept(config: Config) -> None:
@@ -371,7 +250,7 @@ def test_a_bug_in_an_answer_costs_the_answer_and_not_the_map(config: Config) -> 
     failure = running.finish().failure
     assert failure is not None
     assert "a bug" in failure
-    assert pipeline.failure(0.0) is None
+    assert pipeline.watch(0.0) is None
     assert pipeline.stop(5.0) == ()
 
 

@@ -157,7 +157,7 @@ class NoMap(Pipeline):
 
     def finish(self, finish: Finish) -> bool:
         finished = Finished(finish.number, SAVED)
-        self.gateway.on_map(Mapped(None, (), RunReport(0, 0.0, 0.0), finished))
+        self.gateway.on_map(Mapped(None, (), RunReport(0, 0.0, 0.0), 0, 0, finished))
         return True
 
     def request(

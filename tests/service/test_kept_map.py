@@ -9,6 +9,7 @@ import signal
 import sqlite3
 from contextlib import closing
 from dataclasses import replace
+from functools import partial
 from itertools import count
 from pathlib import Path
 
@@ -22,7 +23,7 @@ from hmt_service.client import HmtClient
 from hmt_service.core.config import load_config
 from hmt_service.core.geometry import inverse
 from hmt_service.core.odometry import Odometry
-from hmt_service.core.types import EventKind, TrackingFailure
+from hmt_service.core.types import EventKind, Scan, TrackingFailure
 from hmt_service.errors import InvalidInput
 from hmt_service.io.map_check import check_map
 from hmt_service.io.map_file import read_map, write_map
@@ -32,7 +33,8 @@ from tests.flat import path, readings
 from tests.mapped import map_file_in, mapped
 from tests.service.harness import running_daemon, wait_until
 
-KILLS = 6
+KILLS = 2
+CHILD_KILLS = 6
 
 
 def publish(client: HmtClient, first: int, last: int, *, later_s: float = 0.0) -> None:
@@ -40,18 +42,18 @@ def publish(client: HmtClient, first: int, last: int, *, later_s: float = 0.0) -
         client.publish(replace(reading, stamp_s=reading.stamp_s + later_s))
 
 
+def is_replaced(client: HmtClient, pid: int) -> bool:
+    return pid not in {process.pid for process in client.status().processes}
+
+
 def wait_for(client: HmtClient, count: str, least: int) -> None:
     wait_until(lambda: getattr(client.status(), count) >= least)
 
 
-@pytest.mark.parametrize("victim", [ProcessName.TOPOLOGY, ProcessName.ODOMETRY, None])
-def test_what_is_stored_survives_a_kill_at_any_moment(
-    tmp_path: Path, victim: ProcessName | None
-) -> None:
-    """None: all of them at once."""
+def test_what_is_stored_survives_a_kill_of_everything_at_any_moment(tmp_path: Path) -> None:
     rng, known = np.random.default_rng(3), tmp_path / "known.hmt"
     stored = 0
-    for kill in range(KILLS // 3):
+    for kill in range(KILLS):
         with (
             running_daemon(tmp_path / "out", map_file=known) as daemon,
             daemon.client() as client,
@@ -62,20 +64,37 @@ def test_what_is_stored_survives_a_kill_at_any_moment(
             wait_for(client, "processed_scans", 101 + int(rng.integers(0, 200)))
             status = client.status()
             stored = status.stored_keyframes
-            processes = {process.name: process.pid for process in status.processes}
-            if victim is None:
-                daemon.process.kill()
-                for pid in processes.values():
-                    os.kill(pid, signal.SIGKILL)
-            else:
-                os.kill(processes[victim], signal.SIGKILL)
+            daemon.process.kill()
+            for process in status.processes:
+                os.kill(process.pid, signal.SIGKILL)
             daemon.process.wait(10.0)
         assert check_map(known) == ()
         held = read_map(known)
         assert len(held.keyframes) >= stored > 0
     # Every daemon went on with what the one before had stored.
     begun = [k for k in held.keyframes if k.failure is TrackingFailure.NEW_SESSION]
-    assert len(begun) == KILLS // 3 - 1
+    assert len(begun) == KILLS - 1
+
+
+def test_the_map_is_whole_whichever_child_dies_at_any_moment(tmp_path: Path) -> None:
+    rng, known = np.random.default_rng(4), tmp_path / "known.hmt"
+    with running_daemon(tmp_path / "out", map_file=known) as daemon, daemon.client() as client:
+        for kill in range(CHILD_KILLS):
+            publish(client, 50 * kill, 50 * kill + 50)
+            wait_for(client, "processed_scans", 50 * kill + int(rng.integers(1, 50)))
+            victim = client.status().processes[kill % 2]
+            os.kill(victim.pid, signal.SIGKILL)
+            wait_until(partial(is_replaced, client, victim.pid))
+        assert client.finish().processed_scans == 50 * CHILD_KILLS
+        assert sum(process.restarts for process in client.status().processes) == CHILD_KILLS
+        daemon.process.terminate()
+        daemon.output()
+    assert daemon.process.returncode == 0
+    assert check_map(known) == ()
+    held = read_map(known)
+    assert [k.failure for k in held.keyframes] == [None] * len(held.keyframes)
+    scans = [r.stamp_s for r in readings(50 * CHILD_KILLS) if isinstance(r, Scan)]
+    assert [scan.stamp_s for scan in held.scans] == scans
 
 
 def test_a_daemon_goes_on_with_a_map_and_says_where_it_is(tmp_path: Path) -> None:

@@ -131,28 +131,53 @@ def test_a_client_can_stop_the_daemon(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", [ProcessName.ODOMETRY, ProcessName.TOPOLOGY])
-def test_a_killed_process_ends_the_daemon_at_once_with_its_name(
+def test_another_process_takes_the_place_of_one_that_was_killed(
     tmp_path: Path, name: ProcessName
 ) -> None:
+    with (
+        running_daemon(tmp_path / "out") as daemon,
+        daemon.client() as client,
+        recorded_events(daemon) as events,
+    ):
+        publish(client, 60)
+        pid = pid_of(client, name)
+        os.kill(pid, signal.SIGKILL)
+        wait_until(lambda: pid_of(client, name) != pid)
+        # Who asks where the robot is gets an answer meanwhile.
+        assert client.pose().stamp_s >= readings(1)[0].stamp_s
+        wait_until(lambda: client.status().state is DaemonState.RUNNING)
+        assert {p.name: p.restarts for p in client.status().processes}[name] == 1
+        for reading in readings(100)[120:]:
+            client.publish(reading)
+        assert client.finish().processed_scans == 100
+        daemon.process.terminate()
+        output = daemon.output()
+    assert daemon.process.returncode == 0
+    assert "100 scans in the map, 0 samples not in it" in output
+    reason = f"process {name} (pid {pid}) was killed by SIGKILL: another one goes on where it was"
+    failed, restarted = (e for e in events if e.kind.startswith("process_"))
+    assert (failed.kind, failed.message) == (EventKind.PROCESS_FAILED, reason)
+    assert restarted.kind is EventKind.PROCESS_RESTARTED
+    assert 0.0 < restarted.numbers["outage_s"] < 20.0
+    assert len(read_tum(daemon.out / "trajectory.tum")) == 100
+
+
+def test_a_daemon_ends_when_no_process_gets_ready(tmp_path: Path) -> None:
     with running_daemon(tmp_path / "out") as daemon, daemon.client() as client:
         publish(client, 60)
         client.finish()
         for path in daemon.out.iterdir():
             path.unlink()
-        pid = pid_of(client, name)
-        with recorded_events(daemon) as events:
-            started_s = time.monotonic()
-            os.kill(pid, signal.SIGKILL)
-            output = daemon.output()
-            assert time.monotonic() - started_s < 5.0
-    reason = f"process {name} (pid {pid}) was killed by SIGKILL"
+        killed: set[int] = set()
+        while daemon.process.poll() is None and len(killed) < 6:
+            with suppress(HmtError, ProcessLookupError):
+                pid = pid_of(client, ProcessName.ODOMETRY)
+                if pid > 0 and pid not in killed:
+                    os.kill(pid, signal.SIGKILL)
+                    killed.add(pid)
+        output = daemon.output()
     assert daemon.process.returncode == PROCESS_FAILED
-    assert f"stopped by {reason}" in output
-    assert [event.kind for event in events if event.message == reason] == ["process_failed"]
-    # The map is the topology's: it survives the odometry.
-    is_saved = name is ProcessName.ODOMETRY
-    assert sorted(path.name for path in daemon.out.iterdir()) == (FILES if is_saved else [])
-    assert ("not saved" in output) is not is_saved
+    assert re.search(r"stopped by process odometry \(pid \d+\) was killed by SIGKILL", output)
 
 
 @contextmanager
@@ -204,20 +229,18 @@ def test_children_end_when_the_parent_is_killed(tmp_path: Path) -> None:
         wait_until(lambda: not any(map(is_alive, pids)), timeout_s=5.0)
 
 
-def test_a_call_that_waits_when_the_daemon_dies_gets_an_error(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", [ProcessName.ODOMETRY, ProcessName.TOPOLOGY])
+def test_a_call_that_waits_while_a_process_dies_is_answered(
+    tmp_path: Path, name: ProcessName
+) -> None:
     with running_daemon(tmp_path / "out") as daemon, daemon.client() as client:
         publish(client, 1000)
-        pid = pid_of(client, ProcessName.ODOMETRY)
+        pid = pid_of(client, name)
         with ThreadPoolExecutor(max_workers=1) as pool:
             waiting = pool.submit(client.finish, timeout_s=60.0)
             wait_until(lambda: client.status().processed_scans > 0)
             os.kill(pid, signal.SIGKILL)
-            started_s = time.monotonic()
-            # Either the survivor finishes what it has, or nobody does; never silence.
-            with suppress(HmtError):
-                assert waiting.result(timeout=10.0).processed_scans < 1000
-            assert time.monotonic() - started_s < 8.0
-        assert daemon.process.wait(5.0) == PROCESS_FAILED
+            assert waiting.result(timeout=60.0).processed_scans == 1000
 
 
 def test_a_daemon_serves_through_a_router(tmp_path: Path) -> None:

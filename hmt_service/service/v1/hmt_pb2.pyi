@@ -27,6 +27,7 @@ class EventKind(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     EVENT_KIND_PRESET_CONFIRMED: _ClassVar[EventKind]
     EVENT_KIND_NOT_SAVED: _ClassVar[EventKind]
     EVENT_KIND_OVER_BUDGET: _ClassVar[EventKind]
+    EVENT_KIND_PROCESS_RESTARTED: _ClassVar[EventKind]
 
 class DaemonState(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
@@ -58,6 +59,7 @@ EVENT_KIND_PRESET_DOUBTED: EventKind
 EVENT_KIND_PRESET_CONFIRMED: EventKind
 EVENT_KIND_NOT_SAVED: EventKind
 EVENT_KIND_OVER_BUDGET: EventKind
+EVENT_KIND_PROCESS_RESTARTED: EventKind
 DAEMON_STATE_UNSPECIFIED: DaemonState
 DAEMON_STATE_STARTING: DaemonState
 DAEMON_STATE_RUNNING: DaemonState
@@ -377,20 +379,22 @@ class History(_message.Message):
     def __init__(self, beliefs: _Optional[_Iterable[_Union[Belief, _Mapping]]] = ..., revision: _Optional[int] = ...) -> None: ...
 
 class ProcessStatus(_message.Message):
-    __slots__ = ("name", "pid", "is_ready", "backlog", "processed", "busy_s")
+    __slots__ = ("name", "pid", "is_ready", "backlog", "processed", "busy_s", "restarts")
     NAME_FIELD_NUMBER: _ClassVar[int]
     PID_FIELD_NUMBER: _ClassVar[int]
     IS_READY_FIELD_NUMBER: _ClassVar[int]
     BACKLOG_FIELD_NUMBER: _ClassVar[int]
     PROCESSED_FIELD_NUMBER: _ClassVar[int]
     BUSY_S_FIELD_NUMBER: _ClassVar[int]
+    RESTARTS_FIELD_NUMBER: _ClassVar[int]
     name: str
     pid: int
     is_ready: bool
     backlog: int
     processed: int
     busy_s: float
-    def __init__(self, name: _Optional[str] = ..., pid: _Optional[int] = ..., is_ready: _Optional[bool] = ..., backlog: _Optional[int] = ..., processed: _Optional[int] = ..., busy_s: _Optional[float] = ...) -> None: ...
+    restarts: int
+    def __init__(self, name: _Optional[str] = ..., pid: _Optional[int] = ..., is_ready: _Optional[bool] = ..., backlog: _Optional[int] = ..., processed: _Optional[int] = ..., busy_s: _Optional[float] = ..., restarts: _Optional[int] = ...) -> None: ...
 
 class InputCounts(_message.Message):
     __slots__ = ("received", "accepted", "refused", "queued", "queued_bytes", "discarded", "reordering", "dropped_beams")
