@@ -149,8 +149,7 @@ class Engine:
             held = f"{len(stored.hypotheses)} hypotheses, {len(stored.visits)} visits"
             raise InvalidInput(f"the map is empty: {held}")
         engine = cls(config, seed=seed, budget=budget)
-        for scan in stored.scans:
-            engine._scans.append(scan.stamp_s, scan.keyframe_index, scan.keyframe_from_body)
+        engine._scans.extend(stored.scans)
         visits = engine._visits = restored_visits(stored, config, budget)
         for keyframe in visits.all_keyframes():
             engine._observation.learn(keyframe)

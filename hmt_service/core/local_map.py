@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import gammaincinv
 
 from hmt_service.core.config import Config
 from hmt_service.core.geometry import (
@@ -59,7 +59,7 @@ _TILT = {3: 0.1, 6: 0.05}
 # Standard deviation of a direction that a scan says nothing about, m and rad.
 _UNSEEN = 10.0
 # Largest squared distance of a prior that is believed: 95 % of all that are honest are nearer.
-_GATE = {axes: float(chi2.ppf(0.95, axes)) for axes in (3, 6)}
+_GATE = {axes: 2.0 * float(gammaincinv(0.5 * axes, 0.95)) for axes in (3, 6)}
 
 
 @dataclass(frozen=True, slots=True, eq=False)

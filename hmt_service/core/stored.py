@@ -118,6 +118,13 @@ class ScanLog:
         self._keyframes.append(keyframe_index)
         self._tangents.extend(log(keyframe_from_body))
 
+    def extend(self, scans: Sequence[StoredScan]) -> None:
+        """Add scans in the order that they came, at least one."""
+        self._stamps_s.extend(scan.stamp_s for scan in scans)
+        self._keyframes.extend(scan.keyframe_index for scan in scans)
+        poses = np.stack([scan.keyframe_from_body for scan in scans])
+        self._tangents.extend(log(poses).astype(np.float32).ravel().tolist())
+
     def scans(self) -> Sequence[StoredScan]:
         """Return the scans so far, in the order that they came."""
         full, rest = divmod(len(self._stamps_s), _TOGETHER)
