@@ -155,7 +155,7 @@ def serve(
         )
         save = None
         if out is not None:
-            save = partial(save_results, directory=out, config=settings, seed=seed, kept=map_file)
+            save = partial(save_results, directory=out, config=settings, seed=seed)
         daemon = Daemon(
             DaemonSettings(
                 keys=Keys(site, robot),

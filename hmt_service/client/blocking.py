@@ -177,6 +177,9 @@ class HmtClient:
     compare = _answered(Calls.compare)
     finish = _answered(Calls.finish)
     save = _answered(Calls.save)
+    relocalize = _answered(Calls.relocalize)
+    load = _answered(Calls.load)
+    reset = _answered(Calls.reset)
     shut_down = _answered(Calls.shut_down)
 
     def poses_live(self, *, capacity: int = 100) -> Live[HmtPose]:

@@ -29,6 +29,7 @@ from hmt_service.service.reports import Ack, Status
 T = TypeVar("T")
 
 _FINISH_S = 600.0
+_CHANGE_S = 60.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,6 +198,22 @@ class Calls:
     def save(self) -> Ask[Ack]:
         """Have the map saved as it is."""
         return Ask(self._keys.control(Control.SAVE), Ack)
+
+    def relocalize(self) -> Ask[Ack]:
+        """Tell that the robot was carried: from its next keyframe on it may be anywhere."""
+        return Ask(self._keys.control(Control.RELOCALIZE), Ack)
+
+    def load(self, name: str) -> Ask[Ack]:
+        """Have the map saved, and go on with another one, where the robot may be anywhere.
+
+        Args:
+            name: Name of its file, which is in the folder of the one that the daemon writes.
+        """
+        return Ask(self._keys.control(Control.LOAD), Ack, {"map": name}, timeout_s=_CHANGE_S)
+
+    def reset(self) -> Ask[Ack]:
+        """Have the map saved and its file given another name, and begin an empty one."""
+        return Ask(self._keys.control(Control.RESET), Ack, timeout_s=_CHANGE_S)
 
     def shut_down(self) -> Ask[Ack]:
         """Have the daemon save the map and end."""

@@ -114,6 +114,7 @@ class Engine:
         self._finished_revision = 0
         self._smoothed: tuple[int, FloatArray] | None = None
         self._first_of_session = 0
+        self._wakes_up = False
         self._frozen_visits = 0
         self._versions: dict[int, tuple[bytes, int]] = {}
 
@@ -165,10 +166,11 @@ class Engine:
         )
         engine._next_hypothesis = 1 + max(h.hypothesis for h in stored.hypotheses)
         engine._revision = engine._finished_revision = stored.revision
-        engine._first_of_session = len(stored.keyframes)
+        begun = len(stored.keyframes) if first_of_session is None else first_of_session
+        engine._first_of_session = begun
+        engine._wakes_up = begun == len(stored.keyframes)
         engine._frozen_visits = len(visits) if is_frozen else 0
-        if first_of_session is not None and first_of_session < engine._first_of_session:
-            engine._first_of_session = first_of_session
+        if not engine._wakes_up:
             engine._recall()
         return engine
 
@@ -214,15 +216,26 @@ class Engine:
         is_next = tracking.keyframe is not None or self.keyframes == self._first_of_session
         return self._first_of_session + tracking.keyframe_index >= self.keyframes + is_next
 
+    def relocalize(self) -> None:
+        """Forget where the robot is: from the next keyframe on it may be anywhere in the map.
+
+        Raises:
+            Unavailable: Before the first keyframe.
+        """
+        if not self._visits:
+            raise Unavailable("there is no map yet: no keyframe has been seen")
+        self._wakes_up = True
+
     def _of_session(self, tracking: Tracking) -> Tracking:
         """Number the keyframes of a new session after those of the map that it goes on with."""
         first, keyframe = self._first_of_session, tracking.keyframe
-        if first == 0:
+        if first == 0 and not self._wakes_up:
             return tracking
         if keyframe is not None:
             keyframe = replace(keyframe, index=first + keyframe.index)
-            if keyframe.index == first:
+            if self._wakes_up:
                 keyframe = awakened(keyframe, is_planar=self._config.sensor.is_planar)
+                self._wakes_up = False
         return replace(tracking, keyframe_index=first + tracking.keyframe_index, keyframe=keyframe)
 
     def _map(self, keyframe: Keyframe, registration: Registration | None) -> tuple[Event, ...]:

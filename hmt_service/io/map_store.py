@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import sqlite3
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 
 from hmt_service.core.stored import StoredMap
@@ -135,6 +135,16 @@ class MapStore:
 
     def _taken(self) -> Unavailable:
         return Unavailable(f"another program has written {self._path}: this map is not in it")
+
+
+def bring_to_rest(path: Path) -> None:
+    """Put what is in the log beside a map file into it, and leave the one file.
+
+    Raises:
+        sqlite3.Error: If somebody uses it, or the file system refuses.
+    """
+    with closing(sqlite3.connect(f"{path.as_uri()}?mode=rw", uri=True)) as database:
+        database.execute("PRAGMA journal_mode = DELETE")
 
 
 def _state_of(path: Path) -> _State | None:

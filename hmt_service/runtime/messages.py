@@ -193,6 +193,11 @@ class SaveRequest:
 
 
 @dataclass(frozen=True, slots=True)
+class RelocalizeRequest:
+    """Forget where in the map the robot is."""
+
+
+@dataclass(frozen=True, slots=True)
 class ProcessStatus:
     """What one child is doing."""
 
@@ -228,7 +233,9 @@ class ProcessFailure:
         return f"process {self.name} (pid {self.pid}) {self.reason}"
 
 
-Request = MapRequest | AreaRequest | CompareRequest | TrajectoryRequest | SaveRequest
+Request = (
+    MapRequest | AreaRequest | CompareRequest | TrajectoryRequest | SaveRequest | RelocalizeRequest
+)
 """What the topology process can be asked."""
 Answer = GlobalMap | AreaDetails | Comparison | Trajectory
 """What it can tell."""
@@ -323,8 +330,9 @@ class Keeper(Protocol):
         """Leave the file at rest."""
 
 
-Save = Callable[["Engine", RunReport], tuple[str, ...]]
-"""Writes the results and returns the files' names; picklable, for the topology process runs it."""
+Save = Callable[["Engine", RunReport, Path | None], tuple[str, ...]]
+"""Writes the results, beside the map file that has just been written if there is one, and returns
+the files' names; picklable, for the topology process runs it."""
 
 
 def _rebuild_mapping(items: dict[Any, Any]) -> MappingProxyType[Any, Any]:

@@ -75,10 +75,10 @@ class Listener(Protocol):
         """Take what the topology made of one scan, or of a `Finish`."""
 
     def on_failure(self, failure: ProcessFailure, *, is_session_over: bool) -> None:
-        """Learn that another process takes the place of one that died.
+        """Learn that another process takes the place of one that died."""
 
-        If the session is over, the next tracking is the first one of a new odometry.
-        """
+    def on_session_over(self) -> None:
+        """Learn that the next tracking is the first of a new odometry, in whatever map comes."""
 
     def on_recovery(self, name: ProcessName, outage_s: float) -> None:
         """Learn that a process which took the place of one that died is as far as that was."""
@@ -130,7 +130,8 @@ class Pipeline:
             budget: How much of the map the topology process may have in memory; None for all.
         """
         self._config = config
-        self._for_topology = (config, seed, save, keeper, budget, encode)
+        self._seed, self._save, self._keeper = seed, save, keeper
+        self._budget, self._encode = budget, encode
         self._progress = Tracked(None, 0, 0.0)
         self._window: deque[Keyframe] = deque(maxlen=config.odometry.window_keyframes)
         self._session = Session()
@@ -160,8 +161,11 @@ class Pipeline:
                 target, args = run_odometry, (self._config, self._tracked_before(is_resumed))
             case _:
                 interrupted = self._session.interrupted if is_resumed else None
-                report = self._session.report
-                target, args = run_topology, (*self._for_topology, report, interrupted)
+                target = run_topology
+                args = (
+                    *(self._config, self._seed, self._save, self._keeper, self._budget),
+                    *(self._encode, self._session.report, interrupted),
+                )
         context = multiprocessing.get_context("spawn")
         child = self._children[name]
         pipes = [context.Pipe() for _ in child.links]
@@ -181,6 +185,24 @@ class Pipeline:
             return TrackedBefore(processed=progress.processed, busy_s=progress.busy_s)
         window = tuple(self._window)
         return TrackedBefore(progress.memory, window, progress.processed, progress.busy_s)
+
+    def end(self) -> None:
+        """End the session and both processes: nothing is written any more; `begin` must follow.
+
+        Readings wait meanwhile. Not to be called while another thread watches.
+        """
+        self._end_session()
+
+    def begin(self, keeper: Keeper | None) -> None:
+        """End the session if there is one, and begin one with another map.
+
+        Args:
+            keeper: Owner of that map's file; None for an empty map that is kept nowhere.
+        """
+        self._end_session()
+        self._keeper = keeper
+        for name in self._children:
+            self._start(name, is_resumed=False)
 
     @property
     def is_ready(self) -> bool:
@@ -318,6 +340,7 @@ class Pipeline:
         if child.process is not None:
             child.process.kill()
             child.process.join()
+            child.process = None
         for link in child.links:
             link.disconnect()
         if name is ProcessName.TOPOLOGY:
@@ -335,6 +358,7 @@ class Pipeline:
         self._window.clear()
         self._progress = replace(self._progress, memory=None)
         self._session = Session(report=self._session.report)
+        self._listener.on_session_over()
 
     def _fail(self, finish: Finish, failure: ProcessFailure) -> None:
         finished = Finished(finish.number, (), f"{failure} while it finished the map")

@@ -40,6 +40,7 @@ from hmt_service.runtime.messages import (
     Mapped,
     MapRequest,
     Ready,
+    RelocalizeRequest,
     Request,
     Result,
     RunReport,
@@ -263,6 +264,9 @@ class _Topology:
                 return self._engine.compare(
                     reference_area=request.reference_area, hypothesis=request.hypothesis
                 )
+            case RelocalizeRequest():
+                self._engine.relocalize()
+                return ()
             case SaveRequest():
                 if self._save is None and self._keeper is None:
                     raise Unavailable("the daemon has no output folder and no map file to save to")
@@ -277,7 +281,8 @@ class _Topology:
             self._note_stored()
             files = (str(self._keeper.path),)
         if self._save is not None:
-            files = (*files, *self._save(self._engine, self._report()))
+            kept = None if self._keeper is None else self._keeper.path
+            files = (*files, *self._save(self._engine, self._report(), kept))
         return files
 
     def keep(self) -> tuple[Event, ...]:

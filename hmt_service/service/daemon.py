@@ -7,6 +7,7 @@ References:
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, wait
 from contextlib import AbstractContextManager, nullcontext
@@ -17,12 +18,20 @@ import zenoh
 
 from hmt_service.core.config import Config
 from hmt_service.core.types import Event, EventKind
-from hmt_service.errors import DaemonFailure
-from hmt_service.runtime.messages import Finished, Keeper, ProcessFailure, ProcessName, Save
+from hmt_service.errors import DaemonFailure, HmtError, InvalidInput, Unavailable
+from hmt_service.runtime.messages import (
+    Finished,
+    ProcessFailure,
+    ProcessName,
+    Result,
+    Save,
+    SaveRequest,
+)
 from hmt_service.runtime.pipeline import Pipeline
 from hmt_service.service.codec import encode
-from hmt_service.service.gateway import Gateway
+from hmt_service.service.gateway import Gateway, MapChange
 from hmt_service.service.intake import IntakeLimits
+from hmt_service.service.kept_map import KeptMap
 from hmt_service.service.keys import Keys
 from hmt_service.service.reports import Status
 from hmt_service.service.ros2 import Ros2Input
@@ -37,6 +46,8 @@ _DRAIN_S = 3.0
 """Time for the input that waits when the daemon is told to stop."""
 _SAVE_S = 4.2
 """Time, from the same moment, after which the map is given up."""
+_CHANGE_S = 30.0
+"""Time to save a map before another one is loaded."""
 _GRACE_S = 0.3
 """Time for a process to end by itself."""
 
@@ -57,7 +68,7 @@ class DaemonSettings:
     """Seed of the engine's random generator."""
     save: Save | None = None
     """Writes the results, in the topology process; None for never."""
-    keeper: Keeper | None = None
+    keeper: KeptMap | None = None
     """Owner of the map file that the map goes on in; None for none."""
     budget: MemoryBudget | None = None
     """How much of the map may be in memory; None for all of it."""
@@ -98,6 +109,8 @@ class Daemon:
     def __init__(self, settings: DaemonSettings) -> None:
         self._settings = settings
         self._reason: str | None = None
+        self._keeper = settings.keeper
+        self._changes: deque[MapChange] = deque()
 
     def request_stop(self, reason: str) -> None:
         """Make `run` return soon; may be called from a signal handler or any thread."""
@@ -132,6 +145,7 @@ class Daemon:
                 ros2=settings.ros2,
                 limits=settings.limits,
                 shut_down=lambda: self.request_stop("a client"),
+                change_map=self._changes.append,
             )
             pipeline.start(gateway)
             try:
@@ -149,7 +163,62 @@ class Daemon:
             if failure is not None:
                 return failure
             gateway.tick()
+            if self._changes:
+                self._change_map(self._changes.popleft(), gateway, pipeline)
         return None
+
+    def _change_map(self, change: MapChange, gateway: Gateway, pipeline: Pipeline) -> None:
+        """Save the map, and go on with another one; or say why not."""
+        try:
+            keeper, files = self._next_keeper(change.name), self._saved(gateway, pipeline)
+            pipeline.end()
+            try:
+                if change.name is None and keeper is not None:
+                    files = keeper.set_aside()
+                self._keeper = keeper
+            finally:
+                pipeline.begin(self._keeper)
+        except HmtError as error:
+            change.answer(error)
+            return
+        change.answer(files)
+
+    def _saved(self, gateway: Gateway, pipeline: Pipeline) -> tuple[str, ...]:
+        """Have the map saved, if it is saved anywhere, and return the files.
+
+        Raises:
+            HmtError: If it is not.
+        """
+        is_kept = self._keeper is not None or self._settings.save is not None
+        if not is_kept or gateway.status().keyframes == 0:
+            return ()
+        saved: Future[Result] = Future()
+        pipeline.request(SaveRequest(), saved.set_result, timeout_s=_CHANGE_S)
+        while not wait([saved], timeout=_TICK_S).done:
+            pipeline.tick()
+            if not pipeline.is_alive(ProcessName.TOPOLOGY):
+                raise Unavailable("the topology process died: the map stays")
+        files = saved.result()
+        if isinstance(files, HmtError):
+            raise files
+        assert isinstance(files, tuple), "a map is not saved in parts"
+        return files
+
+    def _next_keeper(self, name: str | None) -> KeptMap | None:
+        """Return the owner of the map to go on with; None for a name: of an empty one."""
+        keeper = self._keeper
+        if keeper is not None and keeper.is_frozen:
+            raise InvalidInput(f"map {keeper.path} is frozen: it is neither left nor emptied")
+        if name is None:
+            return keeper
+        if keeper is None:
+            raise InvalidInput("the daemon has no map file, and no folder of maps to load from")
+        other = keeper.beside(name)
+        if other.path == keeper.path:
+            raise InvalidInput(f"{name} is the map that the daemon goes on with already")
+        if other.settings() != self._settings.config:
+            raise InvalidInput(f"{name} was made with other settings: start a daemon with it")
+        return other
 
     def _stop(
         self, gateway: Gateway, pipeline: Pipeline, failure: ProcessFailure | None

@@ -16,6 +16,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from functools import partial
 
 import zenoh
@@ -44,6 +45,7 @@ from hmt_service.runtime.messages import (
     MapRequest,
     ProcessFailure,
     ProcessName,
+    RelocalizeRequest,
     Request,
     RunReport,
     SaveRequest,
@@ -77,6 +79,16 @@ _REPORT_S = 1.0
 """Shortest time between two events about refused input."""
 
 
+@dataclass(frozen=True, slots=True)
+class MapChange:
+    """A client wants to go on with another map."""
+
+    name: str | None
+    """Name of its file; None for an empty map instead of the one that there is."""
+    answer: Callable[[tuple[str, ...] | HmtError], None]
+    """To be called once: with the files that hold what there was, or why it stays."""
+
+
 class Gateway:
     """Owner of everything that is declared on Zenoh, and of the latest values to answer from."""
 
@@ -90,6 +102,7 @@ class Gateway:
         ros2: Ros2Input,
         limits: IntakeLimits,
         shut_down: Callable[[], None],
+        change_map: Callable[[MapChange], None],
     ) -> None:
         """Prepare; `open` opens.
 
@@ -101,12 +114,14 @@ class Gateway:
             ros2: What to take from ROS 2 beside the robot's own keys.
             limits: What may wait at the input.
             shut_down: Called when a client asks for it.
+            change_map: Called when a client wants to go on with another map.
         """
         self._session = session
         self._keys = keys
         self._config = config
         self._pipeline = pipeline
         self._shut_down = shut_down
+        self._change_map = change_map
         self._ros2 = ros2
         decoder = ReadingDecoder(config.sensor, ros2.body_from_sensor)
         self._intake = Intake(decoder, limits, submit=pipeline.submit, finish=pipeline.finish)
@@ -258,10 +273,14 @@ class Gateway:
         """Tell what died, and what comes of it."""
         consequence = "another one goes on where it was"
         if is_session_over:
-            self._localizer.forget()
             consequence = "a new session begins, with the map that was stored"
         message = f"{failure}: {consequence}"
         self.publish([Event(EventKind.PROCESS_FAILED, self.stamp_s, message)])
+
+    def on_session_over(self) -> None:
+        """Forget the map and where the robot is in it."""
+        self._snapshot = None
+        self._localizer.forget()
 
     def on_recovery(self, name: ProcessName, outage_s: float) -> None:
         """Tell that all is well again."""
@@ -375,7 +394,7 @@ class Gateway:
                 return None
 
     def _handle_control(self, question: Question[Control]) -> Value | None:
-        question.allow()
+        question.allow(*(["map"] if question.name is Control.LOAD else []))
         match question.name:
             case Control.FINISH if self._is_stopping:
                 raise Unavailable("the daemon is stopping, and saves the map by itself")
@@ -384,6 +403,12 @@ class Gateway:
                 return None
             case Control.SAVE:
                 return self._ask(question, SaveRequest())
+            case Control.RELOCALIZE:
+                return self._ask(question, RelocalizeRequest())
+            case Control.LOAD | Control.RESET:
+                name = question.text("map") if question.name is Control.LOAD else None
+                self._change_map(MapChange(name, lambda result: self._answer(question, result)))
+                return None
             case Control.SHUTDOWN:
                 self._shut_down()
                 return self._ack()
@@ -422,6 +447,9 @@ class Gateway:
         on_result = self._deliveries.begin(question, self._ack)
         self._pipeline.request(request, on_result, timeout_s=timeout_s, part_bytes=part_bytes)
         return None
+
+    def _answer(self, question: Question[Control], result: tuple[str, ...] | HmtError) -> None:
+        question.answer(self._ack(result) if isinstance(result, tuple) else result)
 
     def _finished_ack(self, finished: Finished) -> Ack | HmtError:
         return DaemonFailure(finished.failure) if finished.failure else self._ack(finished.files)

@@ -6,16 +6,22 @@ References:
 
 from __future__ import annotations
 
+import re
+import sqlite3
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hmt_service.core.config import Config
-from hmt_service.errors import NotFound
-from hmt_service.io.map_store import MapStore
+from hmt_service.errors import InvalidInput, NotFound, Unavailable
+from hmt_service.io.map_file import read_config
+from hmt_service.io.map_store import MapStore, bring_to_rest
 
 if TYPE_CHECKING:
     from hmt_service.core.engine import Engine
     from hmt_service.core.visits import MemoryBudget
+
+_NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.-]{0,99}\.hmt")
 
 
 class KeptMap:
@@ -32,6 +38,48 @@ class KeptMap:
         self.is_frozen = is_frozen
         # Where the path is a link, the file that it leads to is written.
         self._store = MapStore(path)
+
+    def beside(self, name: str) -> KeptMap:
+        """Return another map in the same folder, which goes on in the same way.
+
+        Args:
+            name: Name of its file.
+
+        Raises:
+            InvalidInput: If it is not the name of a map file.
+        """
+        if not _NAME.fullmatch(name):
+            raise InvalidInput(f"map={name[:80]!r} is not the name of a file, such as site.hmt")
+        return KeptMap(self.path.parent / name, is_frozen=self.is_frozen)
+
+    def settings(self) -> Config:
+        """Return the settings of the map in the file.
+
+        Raises:
+            NotFound: If there is no such file.
+            InvalidInput: If it is no map file, is damaged or was written by another version.
+        """
+        return read_config(self.path)
+
+    def set_aside(self) -> tuple[str, ...]:
+        """Give the file, which nobody writes any more, another name; return it if there is a file.
+
+        Raises:
+            Unavailable: If the file system refuses.
+        """
+        if not self.path.exists():
+            return ()
+        stem, suffix = self.path.stem, self.path.suffix
+        for number in count(1):
+            aside = self.path.with_name(f"{stem}-{number}{suffix}")
+            if not aside.exists():
+                break
+        try:
+            bring_to_rest(self.path)
+            self.path.rename(aside)
+        except (OSError, sqlite3.Error) as error:
+            raise Unavailable(f"{self.path} is not set aside: {error}") from error
+        return (str(aside),)
 
     def engine(
         self,

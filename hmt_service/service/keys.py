@@ -64,6 +64,9 @@ class Control(StrEnum):
 
     FINISH = "finish"
     SAVE = "save"
+    RELOCALIZE = "relocalize"
+    LOAD = "load"
+    RESET = "reset"
     SHUTDOWN = "shutdown"
 
 

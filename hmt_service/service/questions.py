@@ -148,6 +148,17 @@ class Question(Generic[Name]):
             )
         return size
 
+    def text(self, name: str) -> str:
+        """Return a parameter.
+
+        Raises:
+            InvalidInput: If it is missing.
+        """
+        text = self._parameters.get(name)
+        if not text:
+            raise InvalidInput(f"{self.name} needs {name}=...")
+        return text
+
     def choice(self, name: str, default: Choice) -> Choice:
         """Return a parameter that is one of the values of the default's type.
 

@@ -28,11 +28,11 @@ EVENTS, BELIEFS = "events.jsonl", "posterior.jsonl"
 def save_results(
     engine: Engine,
     report: RunReport,
+    kept: Path | None = None,
     *,
     directory: Path,
     config: Config,
     seed: int,
-    kept: Path | None = None,
 ) -> tuple[str, ...]:
     """Write trajectory, map, events, beliefs and summary, each replaced as a whole.
 
@@ -41,10 +41,10 @@ def save_results(
     Args:
         engine: What was built.
         report: What it has cost.
+        kept: Map file that has just been written by its owner; the one of the results may be it.
         directory: Where to write; made when it does not exist.
         config: Settings that it was built with.
         seed: Seed that it was built with.
-        kept: Map file that has just been written by its owner; the one of the results may be it.
 
     Returns:
         The names of the files.

@@ -34,6 +34,7 @@ class Recorder:
         self.finished: list[Finished] = []
         self.failures: list[tuple[ProcessFailure, bool]] = []
         self.recovered: list[ProcessName] = []
+        self.sessions = 0
         self._has_finished = threading.Event()
 
     def on_tracking(self, tracking: Tracking) -> None:
@@ -47,6 +48,9 @@ class Recorder:
 
     def on_failure(self, failure: ProcessFailure, *, is_session_over: bool) -> None:
         self.failures.append((failure, is_session_over))
+
+    def on_session_over(self) -> None:
+        self.sessions += 1
 
     def on_recovery(self, name: ProcessName, outage_s: float) -> None:
         assert outage_s > 0.0

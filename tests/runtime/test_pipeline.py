@@ -32,24 +32,26 @@ from tests.flat import SETTINGS, readings
 from tests.runtime.harness import DEADLINE_S, Answers, Recorder, Running, encode
 
 
-def save_area_count(engine: Engine, report: RunReport) -> tuple[str, ...]:
+def save_area_count(engine: Engine, report: RunReport, _kept: Path | None) -> tuple[str, ...]:
     """Stand for the files: what is known here is told in a name."""
     snapshot = engine.snapshot()
     assert snapshot is not None
     return (f"{snapshot.areas} areas of {report.scans} scans",)
 
 
-def fail_to_save(_engine: Engine, _report: RunReport) -> tuple[str, ...]:
+def fail_to_save(_engine: Engine, _report: RunReport, _kept: Path | None) -> tuple[str, ...]:
     raise OSError(28, "No space left on device")
 
 
-def append_trajectory(log: Path, engine: Engine, _report: RunReport) -> tuple[str, ...]:
+def append_trajectory(
+    log: Path, engine: Engine, _report: RunReport, _kept: Path | None
+) -> tuple[str, ...]:
     with log.open("a") as file:
         file.write(f"{len(engine.trajectory())} poses\n")
     return ()
 
 
-def stumble(_engine: Engine, _report: RunReport) -> tuple[str, ...]:
+def stumble(_engine: Engine, _report: RunReport, _kept: Path | None) -> tuple[str, ...]:
     raise ZeroDivisionError("a bug")
 
 

@@ -41,11 +41,11 @@ SCANS = 160
 BOTH = [ProcessName.ODOMETRY, ProcessName.TOPOLOGY]
 
 
-def count_scans(engine: Engine, report: RunReport) -> tuple[str, ...]:
+def count_scans(engine: Engine, report: RunReport, _kept: Path | None) -> tuple[str, ...]:
     return (f"{engine.scans} of {report.scans} scans",)
 
 
-def die(_engine: Engine, _report: RunReport) -> tuple[str, ...]:
+def die(_engine: Engine, _report: RunReport, _kept: Path | None) -> tuple[str, ...]:
     os.kill(os.getpid(), signal.SIGKILL)
     return ()
 

@@ -185,6 +185,7 @@ def serving(endpoints: Endpoints, *, robot: str = "robot") -> Iterator[NoMap]:
             ros2=Ros2Input(),
             limits=IntakeLimits(),
             shut_down=pipeline.shut_down,
+            change_map=lambda change: change.answer(SAVED),
         )
         pipeline.gateway.open()
         try:
