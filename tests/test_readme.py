@@ -39,7 +39,7 @@ def test_every_key_is_in_the_key_table(
     prefix: str, names: type[Input] | type[Topic] | type[Call] | type[Control]
 ) -> None:
     base = re.escape("| `hmt/{site}/{robot}/" + prefix)
-    rows = re.findall(rf"^{base}([a-z{{}},]+)`", README, re.MULTILINE)
+    rows = re.findall(rf"^{base}([a-z_{{}},]+)`", README, re.MULTILINE)
     documented = {name for row in rows for name in row.strip("{}").split(",")}
     assert documented == set(names)
 

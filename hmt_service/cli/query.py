@@ -8,7 +8,7 @@ References: own.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -23,6 +23,7 @@ from hmt_service.cli.connection import (
     ZenohConfig,
     connected,
 )
+from hmt_service.cli.tables import print_json, print_tables, table_of
 from hmt_service.core.geometry import GaussianPose, yaw_of
 from hmt_service.core.types import EventKind, MapMethod
 
@@ -59,8 +60,8 @@ def status(
     """Show what the daemon has received, refused and processed."""
     with connected(connect, site, robot, zenoh_config, timeout_s=timeout) as client:
         answer = client.status()
-    if not _print_json(answer, is_wanted=as_json):
-        _print(_pairs(f"{site}/{robot}", _status_rows(answer)))
+    if not print_json(answer, is_wanted=as_json):
+        print_tables(_pairs(f"{site}/{robot}", _status_rows(answer)))
 
 
 def health(
@@ -93,7 +94,7 @@ def pose(
     """Show where the robot is, and how sure that is."""
     with connected(connect, site, robot, zenoh_config, timeout_s=timeout) as client:
         answer = client.pose()
-    if _print_json(answer, is_wanted=as_json):
+    if print_json(answer, is_wanted=as_json):
         return
     rows = {
         "stamp": f"{answer.stamp_s:.3f} s",
@@ -103,7 +104,7 @@ def pose(
         f"pose in the frame of area {answer.reference_area}": _pose(answer.reference_from_body),
         "hypothesis": f"{answer.hypothesis}, revision {answer.revision}",
     }
-    _print(_pairs("pose", rows))
+    print_tables(_pairs("pose", rows))
 
 
 def posterior(
@@ -134,11 +135,11 @@ def posterior(
         return
     with connected(connect, site, robot, zenoh_config, timeout_s=timeout) as client:
         answer = client.posterior()
-    if _print_json(answer, is_wanted=as_json):
+    if print_json(answer, is_wanted=as_json):
         return
     ess = answer.effective_sample_size
-    _print(
-        _table(
+    print_tables(
+        table_of(
             f"revision {answer.revision}, effective sample size {ess:.1f}",
             ("hypothesis", "probability", "areas", "loop closures", "current area", "path"),
             (
@@ -181,7 +182,7 @@ def events(
         with connected(connect, site, robot, zenoh_config, timeout_s=timeout) as client:
             answer = client.events()
     answer = tuple(event for event in answer if not kind or event.kind in kind)
-    if _print_json(answer, is_wanted=as_json):
+    if print_json(answer, is_wanted=as_json):
         return
     rows = (
         (
@@ -192,7 +193,7 @@ def events(
         )
         for event in answer
     )
-    _print(_table(f"{len(answer)} events", ("stamp s", "kind", "what", "numbers"), rows))
+    print_tables(table_of(f"{len(answer)} events", ("stamp s", "kind", "what", "numbers"), rows))
 
 
 def areas(
@@ -208,8 +209,8 @@ def areas(
     """Show all areas: where they are, how often they were visited, what they border on."""
     with connected(connect, site, robot, zenoh_config, timeout_s=timeout) as client:
         answer = client.areas(reference=reference, hypothesis=hypothesis)
-    if not _print_json(answer, is_wanted=as_json):
-        _print(_areas_table(answer))
+    if not print_json(answer, is_wanted=as_json):
+        print_tables(_areas_table(answer))
 
 
 def map_(
@@ -242,8 +243,8 @@ def map_(
             hypothesis=hypothesis,
             with_points=False,
         )
-    if not _print_json(answer, is_wanted=as_json):
-        _print(_areas_table(answer))
+    if not print_json(answer, is_wanted=as_json):
+        print_tables(_areas_table(answer))
 
 
 def compare(
@@ -259,11 +260,11 @@ def compare(
     """Show how far the shortest-path map is from the consistent one, area by area."""
     with connected(connect, site, robot, zenoh_config, timeout_s=timeout) as client:
         answer = client.compare(reference=reference, hypothesis=hypothesis)
-    if _print_json(answer, is_wanted=as_json):
+    if print_json(answer, is_wanted=as_json):
         return
     title = f"frame of area {answer.reference_area}, hypothesis {answer.hypothesis}"
-    _print(
-        _table(
+    print_tables(
+        table_of(
             f"{title}: shortest paths against consistent",
             ("area", "distance m", "angle deg", "σ consistent m", "σ shortest path m"),
             (
@@ -277,7 +278,7 @@ def compare(
                 for area in answer.areas
             ),
         ),
-        _table(
+        table_of(
             "contradiction between arc and areas",
             ("arc", "consistent m", "shortest path m"),
             (
@@ -326,8 +327,8 @@ def _show_history(
         from hmt_service.viz.posterior import draw_history
 
         draw_history(beliefs, out)
-    elif not _print_json(beliefs, is_wanted=as_json):
-        _print(_history_table(beliefs))
+    elif not print_json(beliefs, is_wanted=as_json):
+        print_tables(_history_table(beliefs))
 
 
 def _history_table(beliefs: tuple[Belief, ...]) -> Table:
@@ -343,7 +344,7 @@ def _history_table(beliefs: tuple[Belief, ...]) -> Table:
         for belief in beliefs
     )
     headings = ("stamp s", "effective sample size", "area: probability")
-    return _table("where the robot was believed to be, where that changed", headings, rows)
+    return table_of("where the robot was believed to be, where that changed", headings, rows)
 
 
 def _draw(
@@ -407,7 +408,7 @@ def _areas_table(answer: GlobalMap) -> Table:
     for arc in answer.arcs:
         neighbours[arc.area_a].append(arc.area_b)
         neighbours[arc.area_b].append(arc.area_a)
-    return _table(
+    return table_of(
         f"{answer.method} map in the frame of area {answer.reference_area}, hypothesis "
         f"{answer.hypothesis} (probability {answer.probability:.3f}), revision {answer.revision}",
         ("area", "pose", "keyframes", "visits", "neighbours"),
@@ -443,32 +444,5 @@ def _counted(counts: Mapping[str, int]) -> str:
     return ", ".join(f"{count} {reason}" for reason, count in sorted(counts.items())) or "none"
 
 
-def _print_json(value: object, *, is_wanted: bool) -> bool:
-    if is_wanted:
-        from hmt_service.cli.plain import to_json
-
-        typer.echo(to_json(value))
-    return is_wanted
-
-
 def _pairs(title: str, rows: Mapping[str, str]) -> Table:
-    return _table(title, ("", ""), rows.items())
-
-
-def _table(title: str, headings: Iterable[str], rows: Iterable[Iterable[object]]) -> Table:
-    from rich.table import Table
-
-    table = Table(title=title, title_justify="left", show_header=any(headings))
-    for heading in headings:
-        table.add_column(heading)
-    for row in rows:
-        table.add_row(*map(str, row))
-    return table
-
-
-def _print(*tables: Table) -> None:
-    from rich.console import Console
-
-    console = Console()
-    for table in tables:
-        console.print(table)
+    return table_of(title, ("", ""), rows.items())

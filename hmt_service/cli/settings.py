@@ -82,14 +82,21 @@ def pose_on_body(numbers: tuple[float, float, float, float, float, float] | None
     Raises:
         InvalidInput: If a number is not finite.
     """
-    if numbers is None:
-        return None
+    return None if numbers is None else pose_of_numbers(numbers)
+
+
+def pose_of_numbers(numbers: tuple[float, float, float, float, float, float]) -> Pose:
+    """Return the pose of x, y, z, roll, pitch, yaw, m and degrees, shape (4, 4).
+
+    Raises:
+        InvalidInput: If a number is not finite.
+    """
     import numpy as np
 
     from hmt_service.core.geometry import exp, identity
 
     if not np.all(np.isfinite(numbers)):
-        raise InvalidInput(f"pose of the sensor {numbers} is not finite")
+        raise InvalidInput(f"pose {numbers} is not finite")
     x, y, z, *angles_deg = numbers
     roll, pitch, yaw = np.radians(angles_deg)
     pose = identity()

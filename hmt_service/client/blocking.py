@@ -180,6 +180,8 @@ class HmtClient:
     relocalize = _answered(Calls.relocalize)
     load = _answered(Calls.load)
     reset = _answered(Calls.reset)
+    assert_arc = _answered(Calls.assert_arc)
+    retract_arc = _answered(Calls.retract_arc)
     shut_down = _answered(Calls.shut_down)
 
     def poses_live(self, *, capacity: int = 100) -> Live[HmtPose]:

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Generic, TypeVar
 
+from hmt_service.core.geometry import Pose, quaternion_of
 from hmt_service.core.types import (
     AreaDetails,
     Comparison,
@@ -21,6 +22,7 @@ from hmt_service.core.types import (
     MapMethod,
     PlacedArea,
     Posterior,
+    StatementEffect,
     Trajectory,
 )
 from hmt_service.service.keys import Call, Control, Keys
@@ -214,6 +216,47 @@ class Calls:
     def reset(self) -> Ask[Ack]:
         """Have the map saved and its file given another name, and begin an empty one."""
         return Ask(self._keys.control(Control.RESET), Ack, timeout_s=_CHANGE_S)
+
+    def assert_arc(
+        self,
+        area_a: int,
+        area_b: int,
+        a_from_b: Pose,
+        *,
+        sigma_m: float,
+        sigma_rad: float,
+        probability: float,
+    ) -> Ask[StatementEffect]:
+        """Tell where one area is beside another: evidence like any other, and what it did.
+
+        Args:
+            area_a: An area of the most probable hypothesis that the robot has left.
+            area_b: Another one.
+            a_from_b: Pose of its frame in that of the first, shape (4, 4).
+            sigma_m: How well its position is known if it is right, per axis.
+            sigma_rad: The same of its orientation.
+            probability: How probably it is right, in (0, 1).
+        """
+        names = ("x", "y", "z", "qx", "qy", "qz", "qw")
+        numbers = (*a_from_b[:3, 3].tolist(), *quaternion_of(a_from_b).tolist())
+        parameters = {
+            "area_a": area_a,
+            "area_b": area_b,
+            **{name: f"{number:.12g}" for name, number in zip(names, numbers, strict=True)},
+            "sigma_m": sigma_m,
+            "sigma_rad": sigma_rad,
+            "probability": probability,
+        }
+        return Ask(self._keys.control(Control.ASSERT_ARC), StatementEffect, parameters)
+
+    def retract_arc(self, statement: int) -> Ask[StatementEffect]:
+        """Take back what was told, since the daemon began with the map; return what that did.
+
+        Args:
+            statement: Identifier that `assert_arc` has returned.
+        """
+        parameters = {"statement": statement}
+        return Ask(self._keys.control(Control.RETRACT_ARC), StatementEffect, parameters)
 
     def shut_down(self) -> Ask[Ack]:
         """Have the daemon save the map and end."""

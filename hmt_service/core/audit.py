@@ -20,6 +20,7 @@ from hmt_service.core.types import (
     Keyframe,
     Posterior,
     Registration,
+    StatementEffect,
     TrackingFailure,
 )
 
@@ -183,6 +184,30 @@ def over_budget(usage: MemoryUsage, failure: str, stamp_s: float) -> Event:
         "shelf_bytes": float(usage.shelf_bytes),
     }
     return Event(EventKind.OVER_BUDGET, stamp_s, failure, numbers)
+
+
+def asserted(effect: StatementEffect, stamp_s: float) -> Event:
+    """Return what a statement about two areas did."""
+    right = sum(h.after for h in effect.hypotheses if h.is_right)
+    message = (
+        f"statement {effect.statement}: areas {effect.area_a} and {effect.area_b} are where "
+        f"somebody says with probability {right:.3f}"
+    )
+    return Event(EventKind.ARC_ASSERTED, stamp_s, message, {**_of(effect), "probability": right})
+
+
+def retracted(effect: StatementEffect, stamp_s: float) -> Event:
+    """Return that a statement was taken back."""
+    message = f"statement {effect.statement} is taken back"
+    return Event(EventKind.ARC_RETRACTED, stamp_s, message, _of(effect))
+
+
+def _of(effect: StatementEffect) -> dict[str, float]:
+    return {
+        "statement": float(effect.statement),
+        "area_a": float(effect.area_a),
+        "area_b": float(effect.area_b),
+    }
 
 
 def lost(keyframe: Keyframe, failure: TrackingFailure, registration: Registration | None) -> Event:

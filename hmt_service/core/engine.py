@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -25,7 +25,13 @@ from hmt_service.core.audit import Audit
 from hmt_service.core.awakening import awakened
 from hmt_service.core.composition import arcs_of, compose_shortest_paths, residual_m
 from hmt_service.core.config import Config
-from hmt_service.core.geometry import FloatArray, GaussianPose, Pose, inverse, log
+from hmt_service.core.geometry import (
+    FloatArray,
+    GaussianPose,
+    Pose,
+    inverse,
+    log,
+)
 from hmt_service.core.graph import Factor, PoseGraph
 from hmt_service.core.hypotheses import (
     SAME_AREA,
@@ -47,6 +53,7 @@ from hmt_service.core.storing import (
     stored_visits,
 )
 from hmt_service.core.submap import News, Visit, as_points, visit_of
+from hmt_service.core.testimony import Statement, effects, hear, unheard
 from hmt_service.core.transition import Places, Successor, Transition
 from hmt_service.core.types import (
     NO_POINTS,
@@ -65,6 +72,7 @@ from hmt_service.core.types import (
     Registration,
     Snapshot,
     StampedPose,
+    StatementEffect,
     Tracking,
     Trajectory,
 )
@@ -115,6 +123,9 @@ class Engine:
         self._smoothed: tuple[int, FloatArray] | None = None
         self._first_of_session = 0
         self._wakes_up = False
+        self._statements: dict[int, Statement] = {}
+        self._next_statement = 0
+        self._untold: tuple[Event, ...] = ()
         self._frozen_visits = 0
         self._versions: dict[int, tuple[bytes, int]] = {}
 
@@ -510,6 +521,91 @@ class Engine:
         self._audit.note(events)
         self._audit.believe(self._particles.belief(self._open.last_stamp_s))
         return events
+
+    # ------------------------------------------------------------------ what somebody else knows
+
+    def assert_arc(
+        self, area_a: int, area_b: int, a_from_b: GaussianPose, *, probability: float
+    ) -> StatementEffect:
+        """Take what somebody who has seen the site says of two areas as evidence.
+
+        Args:
+            area_a: An area of the most probable hypothesis that the robot has left.
+            area_b: Another one.
+            a_from_b: Pose of its frame in that of the first, as well as it is known.
+            probability: How probably that is right, in (0, 1).
+
+        Returns:
+            What it did to every hypothesis.
+
+        Raises:
+            Unavailable: Before the first keyframe, for a frozen map, or while the robot explores
+                one of the areas.
+            NotFound: If there is no such area.
+            InvalidInput: If it is the same area twice, or a number is out of range.
+        """
+        best = self._choose(None)[0]
+        for area in (area_a, area_b):
+            self._reference(best, area)
+        if self.is_frozen or self._open.visit in (area_a, area_b):
+            raise Unavailable(
+                "areas of a frozen map stay where they are, and an area is known well only when "
+                f"the robot has left it: it is in area {best.current.area}"
+            )
+        is_planar = self._config.sensor.is_planar
+        number, self._next_statement = self._next_statement, self._next_statement + 1
+        said = Statement.of(number, area_a, area_b, a_from_b, probability, is_planar=is_planar)
+        self._statements[number] = said
+        expanded = hear(self._particles.hypotheses, said, self._new_identifier)
+        for weighed in self._weighed.values():
+            said_for = {c.hypothesis: weighed.get(p.hypothesis, 0.0) for p, c in expanded}
+            weighed.update(said_for)
+        return self._convinced(said, expanded, audit.asserted)
+
+    def retract_arc(self, statement: int) -> StatementEffect:
+        """Forget what somebody said; what has been decided because of it since stays decided.
+
+        Args:
+            statement: Identifier of the statement, of this run.
+
+        Raises:
+            NotFound: If there is no such statement, or it was taken back before.
+        """
+        taken_back = self._statements.pop(statement, None)
+        if taken_back is None:
+            known = sorted(self._statements)
+            raise NotFound(f"statement {statement} is not one of this run: {known}")
+        expanded = [(h, unheard(h, statement)) for h in self._particles.hypotheses]
+        return self._convinced(taken_back, expanded, audit.retracted)
+
+    def _convinced(
+        self,
+        statement: Statement,
+        expanded: Sequence[tuple[Hypothesis, Hypothesis]],
+        told: Callable[[StatementEffect, float], Event],
+    ) -> StatementEffect:
+        """Believe what a statement, or that it is taken back, makes of each hypothesis."""
+        before, stamp_s = self._particles.hypotheses, self._open.last_stamp_s
+        dropped = self._particles.replace([child for _, child in expanded])
+        self._revision += 1
+        likely = zip(self._particles.hypotheses, self._particles.probabilities, strict=True)
+        after = {h.hypothesis: float(probability) for h, probability in likely}
+        effect = StatementEffect(
+            statement.statement,
+            statement.area_a,
+            statement.area_b,
+            self._revision,
+            effects(before, expanded, statement, after),
+        )
+        merged = self._particles.merge()
+        pruned = audit.pruned(dropped, stamp_s), audit.pruned(merged, stamp_s, "merged")
+        self._untold += self._audited((told(effect, stamp_s), *pruned[0], *pruned[1]))
+        return effect
+
+    def untold(self) -> tuple[Event, ...]:
+        """Return, once, what was decided otherwise than by `process` and `finish`."""
+        untold, self._untold = self._untold, ()
+        return untold
 
     # ------------------------------------------------------------------ what readers may ask
 

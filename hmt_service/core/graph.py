@@ -404,6 +404,23 @@ class PoseGraph:
         anchors = {visit: anchor for visit, (anchor, _) in self._held.items()}
         return PoseGraph.restored(poses, self.factors, anchors, is_planar=self.is_planar)
 
+    def without(self, factor: Factor) -> PoseGraph:
+        """Return a graph without what an arc says that was fused with others of the same visits.
+
+        Args:
+            factor: An arc that was joined, and not been replaced since.
+        """
+        graph, key = self.copy(), _key(factor.visit_a, factor.visit_b)
+        known, said = _between(graph._factors[key], key[0]), _between(factor, key[0])
+        rest = known.unfused(said)
+        if rest is not None:
+            graph.add_factor(Factor(*key, rest))
+        else:
+            del graph._factors[key]
+            graph._pending.pop(key, None)
+            graph._removed = (*graph._removed, key)
+        return graph
+
     def copy(self) -> PoseGraph:
         """Return an independent graph that shares factors and solution until one changes."""
         other = copy(self)

@@ -97,6 +97,18 @@ class Topology:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Told:
+    """What a statement about the map did to a hypothesis."""
+
+    statement: int
+    """Identifier of the statement."""
+    factor: Factor | None
+    """The arc that it added; None where it is wrong."""
+    log_factor: float
+    """By how much it moved the log weight, before all were normalised."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Hypothesis:
     """One topology of everything that the robot has travelled."""
 
@@ -119,6 +131,8 @@ class Hypothesis:
     log_unlike: float | None = None
     """Log of the probability that the last visit, to a new area, is to one that looks like nothing
     that is known; None if nobody has looked."""
+    told: tuple[Told, ...] = ()
+    """What somebody has said of the map, and that it is right or wrong."""
 
     @property
     def current(self) -> Assignment:
@@ -175,7 +189,13 @@ class Hypothesis:
             graph.fuse_factor(each)
         topology = self.topology.with_visit(assignment)
         return Hypothesis(
-            hypothesis, log_weight, topology, graph, self.unlikely_for, is_found=self.is_found
+            hypothesis,
+            log_weight,
+            topology,
+            graph,
+            self.unlikely_for,
+            is_found=self.is_found,
+            told=self.told,
         )
 
     def recognising(
@@ -212,6 +232,7 @@ class Hypothesis:
             self.unlikely_for,
             sees,
             self.is_found or is_found,
+            told=self.told,
         )
 
     def resembling(self, log_resemblance: float) -> Hypothesis:

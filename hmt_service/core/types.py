@@ -137,6 +137,8 @@ class EventKind(StrEnum):
     NOT_SAVED = "not_saved"
     OVER_BUDGET = "over_budget"
     PROCESS_RESTARTED = "process_restarted"
+    ARC_ASSERTED = "arc_asserted"
+    ARC_RETRACTED = "arc_retracted"
 
 
 @dataclass(frozen=True, slots=True)
@@ -404,6 +406,44 @@ class Comparison:
     """In the order of their identifiers."""
     arcs: tuple[ArcResidual, ...]
     """In the order of their identifiers."""
+
+
+@dataclass(frozen=True, slots=True)
+class HypothesisEffect:
+    """What a statement, or that it is taken back, did to one hypothesis."""
+
+    hypothesis: int
+    """Identifier."""
+    parent: int
+    """The hypothesis that it comes from; itself if it was there before."""
+    is_right: bool
+    """Whether the statement is right in it."""
+    before: float
+    """Probability of the parent before."""
+    after: float
+    """Probability since; 0 if it was dropped."""
+    apart_m: float
+    """How far from where the statement says the parent had one area in the other."""
+    apart_rad: float
+    """The same of its heading."""
+    distance: float | None
+    """The same over what both know of it, as a Mahalanobis distance; None: it knew nothing."""
+
+
+@dataclass(frozen=True, slots=True)
+class StatementEffect:
+    """What a statement about two areas, or that it is taken back, did to the belief."""
+
+    statement: int
+    """Identifier of the statement: what takes it back."""
+    area_a: int
+    """One of the areas."""
+    area_b: int
+    """The other one."""
+    revision: int
+    """Map revision since."""
+    hypotheses: tuple[HypothesisEffect, ...]
+    """All that there are since, and those that it has cost their place, the most probable first."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

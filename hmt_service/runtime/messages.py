@@ -20,6 +20,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Protocol
 
 from hmt_service.core.config import Config
+from hmt_service.core.geometry import GaussianPose
 from hmt_service.core.types import (
     AreaDetails,
     Comparison,
@@ -27,6 +28,7 @@ from hmt_service.core.types import (
     GlobalMap,
     MapMethod,
     Snapshot,
+    StatementEffect,
     Tracking,
     Trajectory,
 )
@@ -47,10 +49,10 @@ class ProcessName(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Ready:
-    """A child has loaded its libraries; the only message that is no answer."""
+    """A child takes work, or has news by itself; the only message that is no answer."""
 
     known: Mapped | None = None
-    """The map that it goes on with, if it does."""
+    """The map, if there is one."""
     first_keyframe: int = 0
     """Keyframes that the map had when the session began."""
 
@@ -197,6 +199,28 @@ class RelocalizeRequest:
     """Forget where in the map the robot is."""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class AssertArcRequest:
+    """Take what somebody says of two areas as evidence."""
+
+    area_a: int
+    """One of them."""
+    area_b: int
+    """The other one."""
+    a_from_b: GaussianPose
+    """Pose of its frame in that of the first, as well as it is known."""
+    probability: float
+    """How probably that is right."""
+
+
+@dataclass(frozen=True, slots=True)
+class RetractArcRequest:
+    """Forget what somebody said."""
+
+    statement: int
+    """Identifier of what was said."""
+
+
 @dataclass(frozen=True, slots=True)
 class ProcessStatus:
     """What one child is doing."""
@@ -234,10 +258,17 @@ class ProcessFailure:
 
 
 Request = (
-    MapRequest | AreaRequest | CompareRequest | TrajectoryRequest | SaveRequest | RelocalizeRequest
+    MapRequest
+    | AreaRequest
+    | CompareRequest
+    | TrajectoryRequest
+    | SaveRequest
+    | RelocalizeRequest
+    | AssertArcRequest
+    | RetractArcRequest
 )
 """What the topology process can be asked."""
-Answer = GlobalMap | AreaDetails | Comparison | Trajectory
+Answer = GlobalMap | AreaDetails | Comparison | Trajectory | StatementEffect
 """What it can tell."""
 
 

@@ -14,7 +14,7 @@ import math
 import signal
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
 from multiprocessing.connection import Connection, wait
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -32,6 +32,7 @@ from hmt_service.runtime.messages import (
     Answer,
     AreaRequest,
     Asked,
+    AssertArcRequest,
     CompareRequest,
     Encode,
     Finish,
@@ -43,6 +44,7 @@ from hmt_service.runtime.messages import (
     RelocalizeRequest,
     Request,
     Result,
+    RetractArcRequest,
     RunReport,
     Save,
     SaveRequest,
@@ -112,7 +114,10 @@ def run_topology(
         _send(work, topology.ready())
         for connection, message in _received(requests, work, idle=topology.rest):
             if connection is requests:
-                for result in topology.answer(message):
+                results = topology.answer(message)
+                if (news := topology.news()) is not None:
+                    _send(work, news)
+                for result in results:
                     _send(requests, result)
             elif isinstance(message, Finish):
                 _send(work, topology.finish(message))
@@ -170,11 +175,16 @@ class _Topology:
             assert tracked.tracking is not None, "only scans are kept"
             self._engine.process(tracked.tracking)
 
-    def ready(self) -> Ready:
+    def ready(self, events: tuple[Event, ...] = ()) -> Ready:
         """Return what is there to begin with."""
         snapshot = self._engine.snapshot()
-        known = None if snapshot is None else self._mapped(snapshot, ())
+        known = None if snapshot is None else self._mapped(snapshot, events)
         return Ready(known, self._engine.first_of_session)
+
+    def news(self) -> Ready | None:
+        """Return what has changed although no scan has come; None for nothing."""
+        events = self._engine.untold()
+        return self.ready(events) if events else None
 
     def map(self, tracked: Tracked) -> Mapped:
         """Take one scan into the map, unless what it is relative to was thrown away before.
@@ -216,13 +226,12 @@ class _Topology:
             return events, Finished(number, (), str(saved))
         return events, Finished(number, saved)
 
-    def answer(self, asked: Asked) -> Iterator[Result]:
-        """Yield what was asked for, in parts, or why there is none."""
+    def answer(self, asked: Asked) -> Iterable[Result]:
+        """Return what was asked for, in parts, or why there is none."""
         result = _guarded(lambda: self._answered(asked))
         if isinstance(result, Wire):
-            yield from parts_of(result, asked.part_bytes or _MOST_WHOLE_BYTES)
-        else:
-            yield result
+            return parts_of(result, asked.part_bytes or _MOST_WHOLE_BYTES)
+        return [result]
 
     def _answered(self, asked: Asked) -> Wire | tuple[str, ...]:
         if time.monotonic() > asked.deadline_s:
@@ -267,6 +276,19 @@ class _Topology:
             case RelocalizeRequest():
                 self._engine.relocalize()
                 return ()
+            case AssertArcRequest():
+                effect = self._engine.assert_arc(
+                    request.area_a,
+                    request.area_b,
+                    request.a_from_b,
+                    probability=request.probability,
+                )
+                self._keep_now()
+                return effect
+            case RetractArcRequest():
+                effect = self._engine.retract_arc(request.statement)
+                self._keep_now()
+                return effect
             case SaveRequest():
                 if self._save is None and self._keeper is None:
                     raise Unavailable("the daemon has no output folder and no map file to save to")
@@ -284,6 +306,12 @@ class _Topology:
             kept = None if self._keeper is None else self._keeper.path
             files = (*files, *self._save(self._engine, self._report(), kept))
         return files
+
+    def _keep_now(self) -> None:
+        """Write the map file with what nobody says twice; if that fails, it is tried again."""
+        self._stored_keyframes = -1
+        self._kept_s = -math.inf
+        self._untold = (*self._untold, *self.keep())
 
     def keep(self) -> tuple[Event, ...]:
         """Write the map file if it lacks keyframes, but not all the time; say what went wrong."""

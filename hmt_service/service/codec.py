@@ -28,12 +28,14 @@ from hmt_service.core.types import (
     History,
     HmtPose,
     Hypotheses,
+    HypothesisEffect,
     HypothesisSummary,
     Localization,
     MapMethod,
     PlacedArea,
     Posterior,
     StampedPose,
+    StatementEffect,
     Trajectory,
 )
 from hmt_service.errors import (
@@ -78,6 +80,7 @@ Value = (
     | AreaDetails
     | Trajectory
     | Comparison
+    | StatementEffect
     | Event
     | tuple[Event, ...]
     | Status
@@ -477,6 +480,50 @@ def _comparison(message: pb.Comparison) -> Comparison:
     )
 
 
+def _effect_to_proto(effect: StatementEffect) -> pb.StatementEffect:
+    return pb.StatementEffect(
+        statement=effect.statement,
+        area_a=effect.area_a,
+        area_b=effect.area_b,
+        revision=effect.revision,
+        hypotheses=[
+            pb.HypothesisEffect(
+                hypothesis=one.hypothesis,
+                parent=one.parent,
+                is_right=one.is_right,
+                before=one.before,
+                after=one.after,
+                apart_m=one.apart_m,
+                apart_rad=one.apart_rad,
+                distance=one.distance,
+            )
+            for one in effect.hypotheses
+        ],
+    )
+
+
+def _effect(message: pb.StatementEffect) -> StatementEffect:
+    return StatementEffect(
+        statement=message.statement,
+        area_a=message.area_a,
+        area_b=message.area_b,
+        revision=message.revision,
+        hypotheses=tuple(
+            HypothesisEffect(
+                hypothesis=one.hypothesis,
+                parent=one.parent,
+                is_right=one.is_right,
+                before=one.before,
+                after=one.after,
+                apart_m=one.apart_m,
+                apart_rad=one.apart_rad,
+                distance=one.distance if one.HasField("distance") else None,
+            )
+            for one in message.hypotheses
+        ),
+    )
+
+
 def _event_to_proto(event: Event) -> pb.Event:
     return pb.Event(
         kind=f"EVENT_KIND_{event.kind.name}",
@@ -629,6 +676,7 @@ _ENCODERS: dict[type, Callable[[Any], Message]] = {
     AreaDetails: _area_details_to_proto,
     Trajectory: _trajectory_to_proto,
     Comparison: _comparison_to_proto,
+    StatementEffect: _effect_to_proto,
     Event: _event_to_proto,
     tuple: lambda events: pb.Events(events=map(_event_to_proto, events)),
     Status: _status_to_proto,
@@ -650,6 +698,7 @@ _DECODERS: dict[str, tuple[type[Message], Callable[[Any], Value | HmtError]]] = 
         (pb.AreaDetails, _area_details),
         (pb.Trajectory, _trajectory),
         (pb.Comparison, _comparison),
+        (pb.StatementEffect, _effect),
         (pb.Event, _event),
         (pb.Events, lambda message: tuple(map(_event, message.events))),
         (

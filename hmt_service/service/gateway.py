@@ -15,15 +15,17 @@ import os
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 
+import numpy as np
 import zenoh
 
 from hmt_service import __version__
 from hmt_service.core.audit import Audit, belief_of
 from hmt_service.core.config import Config
+from hmt_service.core.geometry import GaussianPose, isotropic_covariance, pose_of
 from hmt_service.core.types import (
     Event,
     EventKind,
@@ -33,11 +35,12 @@ from hmt_service.core.types import (
     Snapshot,
     Tracking,
 )
-from hmt_service.errors import DaemonFailure, HmtError, InvalidInput, Unavailable
+from hmt_service.errors import DaemonFailure, HmtError, Unavailable
 from hmt_service.io.ros_messages import RosType
 from hmt_service.runtime.localization import Localizer
 from hmt_service.runtime.messages import (
     AreaRequest,
+    AssertArcRequest,
     CompareRequest,
     Finish,
     Finished,
@@ -47,6 +50,7 @@ from hmt_service.runtime.messages import (
     ProcessName,
     RelocalizeRequest,
     Request,
+    RetractArcRequest,
     RunReport,
     SaveRequest,
     TrajectoryRequest,
@@ -70,6 +74,12 @@ _WARNINGS = (
     EventKind.OVER_BUDGET,
     EventKind.PROCESS_FAILED,
 )
+_NUMBERS = ("x", "y", "z", "qx", "qy", "qz", "qw", "sigma_m", "sigma_rad", "probability")
+_PARAMETERS: Mapping[Control, tuple[str, ...]] = {
+    Control.LOAD: ("map",),
+    Control.ASSERT_ARC: ("area_a", "area_b", *_NUMBERS),
+    Control.RETRACT_ARC: ("statement",),
+}
 _KEPT_EVENTS = 1000
 _KEPT_BELIEFS = 20_000
 _ANSWER_S = 8.0
@@ -394,7 +404,7 @@ class Gateway:
                 return None
 
     def _handle_control(self, question: Question[Control]) -> Value | None:
-        question.allow(*(["map"] if question.name is Control.LOAD else []))
+        question.allow(*_PARAMETERS.get(question.name, ()))
         match question.name:
             case Control.FINISH if self._is_stopping:
                 raise Unavailable("the daemon is stopping, and saves the map by itself")
@@ -405,6 +415,10 @@ class Gateway:
                 return self._ask(question, SaveRequest())
             case Control.RELOCALIZE:
                 return self._ask(question, RelocalizeRequest())
+            case Control.ASSERT_ARC:
+                return self._ask(question, _statement(question))
+            case Control.RETRACT_ARC:
+                return self._ask(question, RetractArcRequest(question.needed_integer("statement")))
             case Control.LOAD | Control.RESET:
                 name = question.text("map") if question.name is Control.LOAD else None
                 self._change_map(MapChange(name, lambda result: self._answer(question, result)))
@@ -460,12 +474,21 @@ class Gateway:
         return Ack(counts.received, counts.accepted, refused, self._report.scans, files)
 
 
+def _statement(question: Question[Control]) -> AssertArcRequest:
+    x, y, z, *quaternion, sigma_m, sigma_rad, probability = map(question.needed_number, _NUMBERS)
+    pose = pose_of(np.array(quaternion), np.array([x, y, z]))
+    covariance = isotropic_covariance(sigma_rad=sigma_rad, sigma_m=sigma_m)
+    return AssertArcRequest(
+        question.needed_integer("area_a"),
+        question.needed_integer("area_b"),
+        GaussianPose(pose, covariance),
+        probability,
+    )
+
+
 def _area_request(question: Question[Call]) -> AreaRequest:
-    area = question.integer("area")
-    if area is None:
-        raise InvalidInput("which area? area=IDENTIFIER is missing")
     return AreaRequest(
-        area,
+        question.needed_integer("area"),
         question.integer("reference"),
         question.integer("hypothesis"),
         with_points=question.integer("points") != 0,

@@ -67,6 +67,8 @@ class Control(StrEnum):
     RELOCALIZE = "relocalize"
     LOAD = "load"
     RESET = "reset"
+    ASSERT_ARC = "assert_arc"
+    RETRACT_ARC = "retract_arc"
     SHUTDOWN = "shutdown"
 
 

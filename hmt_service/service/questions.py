@@ -90,6 +90,28 @@ class Question(Generic[Name]):
             raise InvalidInput(f"{name}={text[:40]!r} is not an integer of 1 to 18 digits")
         return int(text)
 
+    def needed_integer(self, name: str) -> int:
+        """Return a parameter that is an integer >= 0.
+
+        Raises:
+            InvalidInput: If it is none, or missing.
+        """
+        number = self.integer(name)
+        if number is None:
+            raise InvalidInput(f"{self.name} needs {name}=IDENTIFIER")
+        return number
+
+    def needed_number(self, name: str) -> float:
+        """Return a parameter that is a finite number.
+
+        Raises:
+            InvalidInput: If it is none, or missing.
+        """
+        number = self.number(name)
+        if number is None:
+            raise InvalidInput(f"{self.name} needs {name}=NUMBER")
+        return number
+
     def number(self, name: str) -> float | None:
         """Return a parameter that is a finite number, or None without it.
 

@@ -24,12 +24,14 @@ from hmt_service.core.types import (
     History,
     HmtPose,
     Hypotheses,
+    HypothesisEffect,
     HypothesisSummary,
     Localization,
     MapMethod,
     PlacedArea,
     Posterior,
     StampedPose,
+    StatementEffect,
     Trajectory,
 )
 from hmt_service.errors import (
@@ -130,6 +132,27 @@ comparisons = st.builds(
     st.lists(st.builds(AreaDifference, ids, reals, reals, reals, reals), max_size=3).map(tuple),
     st.lists(st.builds(ArcResidual, ids, ids, reals, reals), max_size=3).map(tuple),
 )
+effects = st.builds(
+    StatementEffect,
+    counts,
+    ids,
+    ids,
+    counts,
+    st.lists(
+        st.builds(
+            HypothesisEffect,
+            ids,
+            ids,
+            st.booleans(),
+            shares,
+            shares,
+            reals,
+            reals,
+            st.none() | reals,
+        ),
+        max_size=3,
+    ).map(tuple),
+)
 events = st.builds(
     Event, st.sampled_from(EventKind), reals, texts, st.dictionaries(texts, reals, max_size=3)
 )
@@ -183,7 +206,18 @@ def assert_same(mine: object, theirs: object) -> None:
         assert mine == theirs
 
 
-@given(poses | posteriors | hypotheses | histories | maps | comparisons | events | statuses | acks)
+@given(
+    poses
+    | posteriors
+    | hypotheses
+    | histories
+    | maps
+    | comparisons
+    | effects
+    | events
+    | statuses
+    | acks
+)
 def test_values_come_back_as_they_were(value: Value) -> None:
     message = encode(value)
     assert_same(decode(message.payload, message.encoding), value)

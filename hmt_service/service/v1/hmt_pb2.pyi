@@ -28,6 +28,8 @@ class EventKind(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     EVENT_KIND_NOT_SAVED: _ClassVar[EventKind]
     EVENT_KIND_OVER_BUDGET: _ClassVar[EventKind]
     EVENT_KIND_PROCESS_RESTARTED: _ClassVar[EventKind]
+    EVENT_KIND_ARC_ASSERTED: _ClassVar[EventKind]
+    EVENT_KIND_ARC_RETRACTED: _ClassVar[EventKind]
 
 class DaemonState(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
@@ -60,6 +62,8 @@ EVENT_KIND_PRESET_CONFIRMED: EventKind
 EVENT_KIND_NOT_SAVED: EventKind
 EVENT_KIND_OVER_BUDGET: EventKind
 EVENT_KIND_PROCESS_RESTARTED: EventKind
+EVENT_KIND_ARC_ASSERTED: EventKind
+EVENT_KIND_ARC_RETRACTED: EventKind
 DAEMON_STATE_UNSPECIFIED: DaemonState
 DAEMON_STATE_STARTING: DaemonState
 DAEMON_STATE_RUNNING: DaemonState
@@ -327,6 +331,40 @@ class Comparison(_message.Message):
     areas: _containers.RepeatedCompositeFieldContainer[AreaDifference]
     arcs: _containers.RepeatedCompositeFieldContainer[ArcResidual]
     def __init__(self, reference_area: _Optional[int] = ..., hypothesis: _Optional[int] = ..., revision: _Optional[int] = ..., areas: _Optional[_Iterable[_Union[AreaDifference, _Mapping]]] = ..., arcs: _Optional[_Iterable[_Union[ArcResidual, _Mapping]]] = ...) -> None: ...
+
+class HypothesisEffect(_message.Message):
+    __slots__ = ("hypothesis", "parent", "is_right", "before", "after", "apart_m", "apart_rad", "distance")
+    HYPOTHESIS_FIELD_NUMBER: _ClassVar[int]
+    PARENT_FIELD_NUMBER: _ClassVar[int]
+    IS_RIGHT_FIELD_NUMBER: _ClassVar[int]
+    BEFORE_FIELD_NUMBER: _ClassVar[int]
+    AFTER_FIELD_NUMBER: _ClassVar[int]
+    APART_M_FIELD_NUMBER: _ClassVar[int]
+    APART_RAD_FIELD_NUMBER: _ClassVar[int]
+    DISTANCE_FIELD_NUMBER: _ClassVar[int]
+    hypothesis: int
+    parent: int
+    is_right: bool
+    before: float
+    after: float
+    apart_m: float
+    apart_rad: float
+    distance: float
+    def __init__(self, hypothesis: _Optional[int] = ..., parent: _Optional[int] = ..., is_right: _Optional[bool] = ..., before: _Optional[float] = ..., after: _Optional[float] = ..., apart_m: _Optional[float] = ..., apart_rad: _Optional[float] = ..., distance: _Optional[float] = ...) -> None: ...
+
+class StatementEffect(_message.Message):
+    __slots__ = ("statement", "area_a", "area_b", "revision", "hypotheses")
+    STATEMENT_FIELD_NUMBER: _ClassVar[int]
+    AREA_A_FIELD_NUMBER: _ClassVar[int]
+    AREA_B_FIELD_NUMBER: _ClassVar[int]
+    REVISION_FIELD_NUMBER: _ClassVar[int]
+    HYPOTHESES_FIELD_NUMBER: _ClassVar[int]
+    statement: int
+    area_a: int
+    area_b: int
+    revision: int
+    hypotheses: _containers.RepeatedCompositeFieldContainer[HypothesisEffect]
+    def __init__(self, statement: _Optional[int] = ..., area_a: _Optional[int] = ..., area_b: _Optional[int] = ..., revision: _Optional[int] = ..., hypotheses: _Optional[_Iterable[_Union[HypothesisEffect, _Mapping]]] = ...) -> None: ...
 
 class Event(_message.Message):
     __slots__ = ("kind", "stamp_s", "message", "numbers")
