@@ -91,7 +91,8 @@ def serve(
         float,
         typer.Option(
             min=0.0,
-            help="How long readings wait for earlier ones, s of sensor time; poses are that late.",
+            help="How long readings wait for earlier ones at most, s of sensor time; scans and "
+            "odometry that each come in order wait for each other only.",
         ),
     ] = 0.25,
     metrics: Annotated[
