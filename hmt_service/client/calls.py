@@ -243,11 +243,12 @@ class Calls:
             "area_a": area_a,
             "area_b": area_b,
             **{name: f"{number:.12g}" for name, number in zip(names, numbers, strict=True)},
-            "sigma_m": sigma_m,
-            "sigma_rad": sigma_rad,
-            "probability": probability,
+            "sigma_m": f"{sigma_m:.12g}",
+            "sigma_rad": f"{sigma_rad:.12g}",
+            "probability": f"{probability:.12g}",
         }
-        return Ask(self._keys.control(Control.ASSERT_ARC), StatementEffect, parameters)
+        key = self._keys.control(Control.ASSERT_ARC)
+        return Ask(key, StatementEffect, parameters, timeout_s=_CHANGE_S)
 
     def retract_arc(self, statement: int) -> Ask[StatementEffect]:
         """Take back what was told, since the daemon began with the map; return what that did.
@@ -256,7 +257,8 @@ class Calls:
             statement: Identifier that `assert_arc` has returned.
         """
         parameters = {"statement": statement}
-        return Ask(self._keys.control(Control.RETRACT_ARC), StatementEffect, parameters)
+        key = self._keys.control(Control.RETRACT_ARC)
+        return Ask(key, StatementEffect, parameters, timeout_s=_CHANGE_S)
 
     def shut_down(self) -> Ask[Ack]:
         """Have the daemon save the map and end."""

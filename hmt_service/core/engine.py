@@ -53,7 +53,7 @@ from hmt_service.core.storing import (
     stored_visits,
 )
 from hmt_service.core.submap import News, Visit, as_points, visit_of
-from hmt_service.core.testimony import Statement, effects, hear, unheard
+from hmt_service.core.testimony import Statement, effects, hear, unhear
 from hmt_service.core.transition import Places, Successor, Transition
 from hmt_service.core.types import (
     NO_POINTS,
@@ -124,7 +124,6 @@ class Engine:
         self._first_of_session = 0
         self._wakes_up = False
         self._statements: dict[int, Statement] = {}
-        self._next_statement = 0
         self._untold: tuple[Event, ...] = ()
         self._frozen_visits = 0
         self._versions: dict[int, tuple[bytes, int]] = {}
@@ -486,7 +485,7 @@ class Engine:
         The visits before and after it must have been refined, so that no arc to it is to come.
         """
         best, hypotheses = self._particles.best, self._particles.hypotheses
-        if visit < self._frozen_visits:
+        if visit < self._frozen_visits or any(h.is_told_of(visit) for h in hypotheses):
             return
         to_same = best.topology.visits_to[best.topology.assignments[visit].area]
         others = [v for v in to_same if v != visit and not self._visits.is_forgotten(v)]
@@ -552,15 +551,21 @@ class Engine:
                 "areas of a frozen map stay where they are, and an area is known well only when "
                 f"the robot has left it: it is in area {best.current.area}"
             )
-        is_planar = self._config.sensor.is_planar
-        number, self._next_statement = self._next_statement, self._next_statement + 1
-        said = Statement.of(number, area_a, area_b, a_from_b, probability, is_planar=is_planar)
-        self._statements[number] = said
+        said = Statement.of(
+            self._revision,
+            area_a,
+            area_b,
+            a_from_b,
+            probability,
+            is_planar=self._config.sensor.is_planar,
+        )
         expanded = hear(self._particles.hypotheses, said, self._new_identifier)
+        effect = self._convinced(said, expanded, audit.asserted)
+        self._statements[said.statement] = said
         for weighed in self._weighed.values():
             said_for = {c.hypothesis: weighed.get(p.hypothesis, 0.0) for p, c in expanded}
             weighed.update(said_for)
-        return self._convinced(said, expanded, audit.asserted)
+        return effect
 
     def retract_arc(self, statement: int) -> StatementEffect:
         """Forget what somebody said; what has been decided because of it since stays decided.
@@ -571,12 +576,14 @@ class Engine:
         Raises:
             NotFound: If there is no such statement, or it was taken back before.
         """
-        taken_back = self._statements.pop(statement, None)
-        if taken_back is None:
+        said = self._statements.get(statement)
+        if said is None:
             known = sorted(self._statements)
             raise NotFound(f"statement {statement} is not one of this run: {known}")
-        expanded = [(h, unheard(h, statement)) for h in self._particles.hypotheses]
-        return self._convinced(taken_back, expanded, audit.retracted)
+        expanded = unhear(self._particles.hypotheses, said)
+        effect = self._convinced(said, expanded, audit.retracted)
+        del self._statements[statement]
+        return effect
 
     def _convinced(
         self,
@@ -586,7 +593,10 @@ class Engine:
     ) -> StatementEffect:
         """Believe what a statement, or that it is taken back, makes of each hypothesis."""
         before, stamp_s = self._particles.hypotheses, self._open.last_stamp_s
+        for _, child in expanded:
+            child.graph.poses()  # who cannot be solved must not be believed
         dropped = self._particles.replace([child for _, child in expanded])
+        merged = self._particles.merge()
         self._revision += 1
         likely = zip(self._particles.hypotheses, self._particles.probabilities, strict=True)
         after = {h.hypothesis: float(probability) for h, probability in likely}
@@ -597,7 +607,6 @@ class Engine:
             self._revision,
             effects(before, expanded, statement, after),
         )
-        merged = self._particles.merge()
         pruned = audit.pruned(dropped, stamp_s), audit.pruned(merged, stamp_s, "merged")
         self._untold += self._audited((told(effect, stamp_s), *pruned[0], *pruned[1]))
         return effect

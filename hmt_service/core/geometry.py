@@ -26,10 +26,6 @@ PLANAR_AXES = np.array([2, 3, 4])
 """Tangent components that a planar robot can move along: yaw, x, y."""
 _OFF_PLANE_AXES = np.array([0, 1, 5])
 _SMALL_ANGLE_RAD = 1e-7
-# Share of what another Gaussian knows that rounding may leave of it.
-_NOTHING = 1e-6
-# Newton's, to the last digit also where a radian was said wrong.
-_UNFUSE_STEPS = 10
 ANY_HEADING_RAD = np.pi / np.sqrt(3.0)
 """Standard deviation of a heading that may be anything."""
 
@@ -231,25 +227,6 @@ class GaussianPose:
         covariance = symmetric(np.linalg.inv(own + theirs))
         step = covariance @ theirs @ log(inverse(self.mean) @ other.mean)
         return GaussianPose(self.mean @ exp(step), covariance)
-
-    def unfused(self, other: GaussianPose) -> GaussianPose | None:
-        """Return what this was before another Gaussian was fused with it; None if it was nothing.
-
-        Args:
-            other: One of the factors of this product, Eq. (10).
-        """
-        own = np.linalg.inv(self.covariance)
-        theirs = np.linalg.inv(other.covariance)
-        # What is known of the least known direction, in units of what the other knew of it.
-        white = np.linalg.cholesky(other.covariance)
-        if np.linalg.eigvalsh(white.T @ own @ white)[0] < 1.0 + _NOTHING:
-            return None
-        before = GaussianPose(self.mean, symmetric(np.linalg.inv(own - theirs)))
-        for _ in range(_UNFUSE_STEPS):
-            error = log(inverse(before.fuse(other).mean) @ self.mean)
-            step = exp(before.covariance @ own @ error)
-            before = GaussianPose(before.mean @ step, before.covariance)
-        return before
 
     @property
     def sigma_rad(self) -> float:

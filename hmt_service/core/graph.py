@@ -15,7 +15,7 @@ from __future__ import annotations
 import weakref
 from collections.abc import Callable, Iterable, Mapping
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import networkx as nx
@@ -38,6 +38,8 @@ from hmt_service.core.geometry import (
     yaw_of,
 )
 
+_Key = tuple[int, ...]
+"""Both visits of an arc, the lower one first; of a statement its identifier, too."""
 # The first frame is the reference: 1e-6 rad move what is a kilometre away by a millimetre.
 _REFERENCE_SIGMA = 1e-6
 # Poses that have moved farther than this, m and rad, are linearised anew.
@@ -57,11 +59,15 @@ class Factor:
     """The other end."""
     a_from_b: GaussianPose
     """Relative pose."""
+    statement: int | None = None
+    """What it was stated in, if somebody has said so: an arc of its own, beside what was seen."""
 
     @property
     def reversed(self) -> Factor:
         """The same arc, told from its other end."""
-        return Factor(self.visit_b, self.visit_a, self.a_from_b.inverse())
+        return replace(
+            self, visit_a=self.visit_b, visit_b=self.visit_a, a_from_b=self.a_from_b.inverse()
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,7 +182,7 @@ class _Solver:
         parameters.setOptimizationParams(gtsam.ISAM2GaussNewtonParams(0.1 * _RELINEARISED))
         self._space = space
         self._isam = gtsam.ISAM2(parameters)
-        self._index_of: dict[tuple[int, int], int] = {}
+        self._index_of: dict[_Key, int] = {}
         self._factors = 0
         self._forget()
         self.graphs: weakref.WeakSet[PoseGraph] = weakref.WeakSet()
@@ -199,7 +205,7 @@ class _Solver:
         self,
         reference: int | None,
         factors: Iterable[Factor],
-        removed: Iterable[tuple[int, int]] = (),
+        removed: Iterable[_Key] = (),
     ) -> None:
         """Solve with some more arcs, and without some; a visit that has none left is gone.
 
@@ -213,7 +219,7 @@ class _Solver:
             self._factors += 1
             self.poses[reference] = identity()
         for factor in factors:
-            key = _key(factor.visit_a, factor.visit_b)
+            key = _key_of(factor)
             if key in self._index_of:
                 replaced.append(self._index_of[key])
             self._index_of[key] = self._factors
@@ -240,7 +246,7 @@ class _Solver:
             values.insert(visit, self._space.value(pose))
         for index, factor in enumerate(factors, start=1):
             graph.add(self._space.factor(factor))
-            self._index_of[_key(factor.visit_a, factor.visit_b)] = index
+            self._index_of[_key_of(factor)] = index
         self._factors = graph.size()
         self._solve(graph, values, [])
 
@@ -293,9 +299,9 @@ class PoseGraph:
         """
         self._space = _PLANAR if is_planar else _SPATIAL
         self._visits: dict[int, None] = {}
-        self._factors: dict[tuple[int, int], Factor] = {}
-        self._pending: dict[tuple[int, int], Factor] = {}
-        self._removed: tuple[tuple[int, int], ...] = ()
+        self._factors: dict[_Key, Factor] = {}
+        self._pending: dict[_Key, Factor] = {}
+        self._removed: tuple[_Key, ...] = ()
         self._held: dict[int, tuple[int, Pose]] = {}
         self._has_parts = False
         self._use(_Solver(self._space))
@@ -319,7 +325,7 @@ class PoseGraph:
         """
         graph = cls(is_planar=is_planar)
         graph._visits = dict.fromkeys(sorted(poses))
-        graph._factors = {_key(f.visit_a, f.visit_b): f for f in factors}
+        graph._factors = {_key_of(f): f for f in factors}
         graph._has_parts = any(is_anywhere(f.a_from_b) for f in graph._factors.values())
         graph._held = {
             visit: (anchor, inverse(poses[anchor]) @ poses[visit])
@@ -365,7 +371,7 @@ class PoseGraph:
         if self.is_whole:
             return frozenset(self._visits)
         known = nx.Graph(
-            key for key, factor in self._factors.items() if not is_anywhere(factor.a_from_b)
+            (f.visit_a, f.visit_b) for f in self._factors.values() if not is_anywhere(f.a_from_b)
         )
         known.add_nodes_from(self._visits)
         known.add_edges_from((held, anchor) for held, (anchor, _) in self._held.items())
@@ -402,24 +408,20 @@ class PoseGraph:
         """Return a graph of the same arcs in which one part lies elsewhere."""
         poses = {v: moved @ self.pose(v) if v in part else self.pose(v) for v in self._visits}
         anchors = {visit: anchor for visit, (anchor, _) in self._held.items()}
-        return PoseGraph.restored(poses, self.factors, anchors, is_planar=self.is_planar)
+        arcs = self._factors.values()
+        return PoseGraph.restored(poses, arcs, anchors, is_planar=self.is_planar)
 
-    def without(self, factor: Factor) -> PoseGraph:
-        """Return a graph without what an arc says that was fused with others of the same visits.
-
-        Args:
-            factor: An arc that was joined, and not been replaced since.
-        """
-        graph, key = self.copy(), _key(factor.visit_a, factor.visit_b)
-        known, said = _between(graph._factors[key], key[0]), _between(factor, key[0])
-        rest = known.unfused(said)
-        if rest is not None:
-            graph.add_factor(Factor(*key, rest))
-        else:
-            del graph._factors[key]
-            graph._pending.pop(key, None)
-            graph._removed = (*graph._removed, key)
+    def without(self, statement: int) -> PoseGraph:
+        """Return a graph without the arc that somebody has stated."""
+        graph = self.copy()
+        for key in [key for key, f in graph._factors.items() if f.statement == statement]:
+            graph._remove(key)
         return graph
+
+    def _remove(self, key: _Key) -> None:
+        del self._factors[key]
+        self._pending.pop(key, None)
+        self._removed = (*self._removed, key)
 
     def copy(self) -> PoseGraph:
         """Return an independent graph that shares factors and solution until one changes."""
@@ -433,8 +435,15 @@ class PoseGraph:
 
     @property
     def factors(self) -> tuple[Factor, ...]:
-        """All factors, in the order of their visits."""
-        return tuple(self._factors[key] for key in sorted(self._factors))
+        """What is known of each pair of visits that an arc joins, in their order."""
+        known: dict[_Key, Factor] = {}
+        for key in sorted(self._factors):
+            pair, factor = key[:2], self._factors[key]
+            if pair in known:
+                a_from_b = _between(known[pair], pair[0]).fuse(_between(factor, pair[0]))
+                factor = Factor(pair[0], pair[1], a_from_b)
+            known[pair] = factor
+        return tuple(known.values())
 
     @property
     def visits(self) -> tuple[int, ...]:
@@ -452,13 +461,15 @@ class PoseGraph:
         Repeated matches of the same two visits are not independent: the latest one counts, alone.
         A visit that is new to the graph is placed by the arc.
         """
-        key = _key(factor.visit_a, factor.visit_b)
+        key = _key_of(factor)
         self._factors[key] = self._pending[key] = factor
         self._has_parts |= is_anywhere(factor.a_from_b)
         self._visits.setdefault(factor.visit_b)
 
     def eliminate(self, visit: int, anchor: int) -> None:
         """Take a visit out, and keep what it says of those that it has arcs to, Eq. (10).
+
+        Nobody may have stated an arc to it.
 
         Exact for a visit between two others. Where there are more, what is known of it by its arc
         to the anchor is shared out among the arcs that follow from it, so that nothing counts
@@ -469,24 +480,25 @@ class PoseGraph:
             anchor: A visit that it has an arc to: it keeps its place beside that one.
         """
         self._held[visit] = anchor, inverse(self.pose(anchor)) @ self.pose(visit)
-        arcs = {key: _between(arc, visit) for key, arc in self._factors.items() if visit in key}
+        arcs = {key: _between(arc, visit) for key, arc in self._factors.items() if visit in key[:2]}
         known = arcs.pop(_key(visit, anchor)).inverse()
         shared = GaussianPose(known.mean, max(len(arcs), 1) * known.covariance)
-        for (first, second), visit_from_other in arcs.items():
+        for (first, second, *_), visit_from_other in arcs.items():
             other = second if first == visit else first
             self.fuse_factor(Factor(anchor, other, shared @ visit_from_other))
         for key in (*arcs, _key(visit, anchor)):
-            del self._factors[key]
-            self._pending.pop(key, None)
-            self._removed = (*self._removed, key)
+            self._remove(key)
 
     def fuse_factor(self, factor: Factor) -> None:
         """Add an arc to what is known of the same two visits by other observations."""
+        if factor.statement is not None:
+            self.add_factor(factor)
+            return
         key = _key(factor.visit_a, factor.visit_b)
         a_from_b = _between(factor, key[0])
         if key in self._factors:
             a_from_b = _between(self._factors[key], key[0]).fuse(a_from_b)
-        self.add_factor(Factor(*key, a_from_b))
+        self.add_factor(Factor(key[0], key[1], a_from_b))
 
     def has_arc(self, visit_a: int, visit_b: int) -> bool:
         """Return whether there is an arc between two visits."""
@@ -547,5 +559,10 @@ def _between(factor: Factor, visit: int) -> GaussianPose:
     return factor.a_from_b if factor.visit_a == visit else factor.a_from_b.inverse()
 
 
-def _key(visit_a: int, visit_b: int) -> tuple[int, int]:
+def _key(visit_a: int, visit_b: int) -> _Key:
     return (min(visit_a, visit_b), max(visit_a, visit_b))
+
+
+def _key_of(factor: Factor) -> _Key:
+    pair = _key(factor.visit_a, factor.visit_b)
+    return pair if factor.statement is None else (*pair, factor.statement)

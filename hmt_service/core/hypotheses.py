@@ -102,6 +102,8 @@ class Told:
 
     statement: int
     """Identifier of the statement."""
+    family: int
+    """The hypothesis that heard it, and became one where it is right and one where it is wrong."""
     factor: Factor | None
     """The arc that it added; None where it is wrong."""
     log_factor: float
@@ -288,6 +290,11 @@ class Hypothesis:
         graph = self.graph.copy()
         graph.eliminate(visit, self.topology.assignments[visit].area)
         return replace(self, graph=graph)
+
+    def is_told_of(self, visit: int) -> bool:
+        """Return whether somebody has stated an arc to a visit."""
+        arcs = (told.factor for told in self.told if told.factor is not None)
+        return any(visit in (arc.visit_a, arc.visit_b) for arc in arcs)
 
     def is_same_map(self, other: Hypothesis) -> bool:
         """Return whether the other has the same areas, and all visits where this one has them."""

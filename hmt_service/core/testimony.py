@@ -1,8 +1,9 @@
 """Testimony: what somebody who has seen the site says of two areas is evidence like any other.
 
 A statement is right with the probability that it is made with, and then as good as its covariance
-says; otherwise it says nothing: it could have been any. Every hypothesis becomes two, weighed by
-how well it predicted the statement. Nothing is decided by it, and it can be taken back.
+says. Otherwise its author has drawn it from what the map looks like, or from anywhere: half of what
+is said wrong is plausible, so that nothing is believed more than its author does. Every hypothesis
+becomes two, weighed by how well it predicted the statement; it can be taken back.
 
 References:
     Blanco et al. 2008, Eq. (6) and (14) (what weighs hypotheses).
@@ -33,6 +34,7 @@ from hmt_service.errors import InvalidInput
 
 # What a person may say, and how well: nobody knows a building to less than a tenth of a millimetre.
 _LEAST_M, _MOST_M, _LEAST_RAD = 1e-4, 1e3, 1e-5
+_FARTHEST_M = 1e4
 # Beyond what was seen a wrong statement is not made: m around it, and how much a robot leans.
 _MARGIN_M = 10.0
 _LEAN_RAD = 0.2
@@ -82,6 +84,8 @@ class Statement:
                 f"standard deviations of {sigmas[is_angle]} rad and {sigmas[~is_angle]} m are not "
                 f"in [{_LEAST_RAD:g}, {ANY_HEADING_RAD:.3f}] rad and [{_LEAST_M:g}, {_MOST_M:g}] m"
             )
+        if not np.all(np.abs(a_from_b.mean[:3, 3]) <= _FARTHEST_M):
+            raise InvalidInput(f"position {a_from_b.mean[:3, 3]} m is over {_FARTHEST_M:g} m away")
         mean = project_planar(a_from_b.mean) if is_planar else a_from_b.mean
         said = GaussianPose(mean, confined(a_from_b.covariance, is_planar=is_planar))
         return cls(statement, area_a, area_b, said, probability)
@@ -101,44 +105,40 @@ def hear(
         Parent and child, with a weight that is not normalised; the one in which the statement is
         wrong is its parent still.
     """
-    log_volume = _log_volume_of(hypotheses[0])
-    return [
-        (hypothesis, child)
-        for hypothesis in hypotheses
-        for child in (
-            _right(hypothesis, statement, log_volume, new_identifier()),
-            _wrong(hypothesis, statement, log_volume),
+    log_anywhere = -_log_volume_of(hypotheses[0])
+    log_said = [_log_said(hypothesis, statement, log_anywhere) for hypothesis in hypotheses]
+    log_weights = [hypothesis.log_weight for hypothesis in hypotheses]
+    log_plausible = np.logaddexp.reduce(np.add(log_weights, log_said))
+    log_plausible -= np.logaddexp.reduce(log_weights)
+    log_wrong = math.log(0.5) + float(np.logaddexp(log_anywhere, log_plausible))
+    factor = Factor(statement.area_a, statement.area_b, statement.a_from_b, statement.statement)
+    expanded = []
+    for hypothesis, log_right in zip(hypotheses, log_said, strict=True):
+        right = replace(
+            _told(hypothesis, statement, factor, math.log(statement.probability) + log_right),
+            hypothesis=new_identifier(),
+            graph=hypothesis.graph.joined(factor),
         )
-    ]
+        wrong = _told(hypothesis, statement, None, math.log1p(-statement.probability) + log_wrong)
+        expanded += [(hypothesis, right), (hypothesis, wrong)]
+    return expanded
 
 
-def _right(
-    hypothesis: Hypothesis, statement: Statement, log_volume: float, identifier: int
+def _told(
+    hypothesis: Hypothesis, statement: Statement, factor: Factor | None, log_factor: float
 ) -> Hypothesis:
-    log_factor = math.log(statement.probability)
+    told = Told(statement.statement, hypothesis.hypothesis, factor, log_factor)
+    log_weight = hypothesis.log_weight + log_factor
+    return replace(hypothesis, log_weight=log_weight, told=(*hypothesis.told, told))
+
+
+def _log_said(hypothesis: Hypothesis, statement: Statement, log_anywhere: float) -> float:
+    """Return the log of p(statement) if it is right: where a hypothesis knows nothing, anywhere."""
     predicted = _predicted(hypothesis, statement)
     if predicted is None:
-        log_factor -= log_volume
-    else:
-        axes = PLANAR_AXES if hypothesis.graph.is_planar else np.arange(6)
-        log_factor += _log_density(statement.a_from_b, predicted, axes)
-    factor = Factor(statement.area_a, statement.area_b, statement.a_from_b)
-    return replace(
-        hypothesis,
-        hypothesis=identifier,
-        log_weight=hypothesis.log_weight + log_factor,
-        graph=hypothesis.graph.joined(factor),
-        told=(*hypothesis.told, Told(statement.statement, factor, log_factor)),
-    )
-
-
-def _wrong(hypothesis: Hypothesis, statement: Statement, log_volume: float) -> Hypothesis:
-    log_factor = math.log1p(-statement.probability) - log_volume
-    return replace(
-        hypothesis,
-        log_weight=hypothesis.log_weight + log_factor,
-        told=(*hypothesis.told, Told(statement.statement, None, log_factor)),
-    )
+        return log_anywhere
+    axes = PLANAR_AXES if hypothesis.graph.is_planar else np.arange(6)
+    return _log_density(statement.a_from_b, predicted, axes)
 
 
 def _predicted(hypothesis: Hypothesis, statement: Statement) -> GaussianPose | None:
@@ -155,23 +155,39 @@ def _log_volume_of(hypothesis: Hypothesis) -> float:
     return float(np.log(np.prod(sides_m) * 2.0 * math.pi * (2.0 * _LEAN_RAD) ** 2))
 
 
-def unheard(hypothesis: Hypothesis, statement: int) -> Hypothesis:
-    """Return a hypothesis as if a statement had never been made; what came of it since stays.
+def unhear(
+    hypotheses: Sequence[Hypothesis], statement: Statement
+) -> list[tuple[Hypothesis, Hypothesis]]:
+    """Return what is believed if a statement had not been made; what came of it since stays.
 
     Args:
-        hypothesis: What is believed.
-        statement: Identifier of the statement.
+        hypotheses: What is believed.
+        statement: What was said.
+
+    Returns:
+        Each as it was, and as it is, with a weight that is not normalised.
     """
-    told = next((told for told in hypothesis.told if told.statement == statement), None)
-    if told is None:
-        return hypothesis
-    graph = hypothesis.graph
-    return replace(
-        hypothesis,
-        log_weight=hypothesis.log_weight - told.log_factor,
-        graph=graph if told.factor is None else graph.without(told.factor),
-        told=tuple(other for other in hypothesis.told if other is not told),
-    )
+    found = [
+        next((told for told in h.told if told.statement == statement.statement), None)
+        for h in hypotheses
+    ]
+    sides = {(told.family, told.factor is None) for told in found if told is not None}
+    return [
+        (h, h if told is None else _untold(h, told, is_twin=_twin_of(told) in sides))
+        for h, told in zip(hypotheses, found, strict=True)
+    ]
+
+
+def _twin_of(told: Told) -> tuple[int, bool]:
+    return told.family, told.factor is not None
+
+
+def _untold(hypothesis: Hypothesis, told: Told, *, is_twin: bool) -> Hypothesis:
+    """Return a hypothesis without what it was told; of twins each gets half of what was one's."""
+    log_weight = hypothesis.log_weight - told.log_factor - (math.log(2.0) if is_twin else 0.0)
+    graph = hypothesis.graph if told.factor is None else hypothesis.graph.without(told.statement)
+    rest = tuple(other for other in hypothesis.told if other is not told)
+    return replace(hypothesis, log_weight=log_weight, graph=graph, told=rest)
 
 
 def effects(

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from typing import Any
 
-from hmt_service.runtime.messages import Part, Ready, Stop, dump, load
+from hmt_service.runtime.messages import News, Part, Ready, Stop, dump, load
 from hmt_service.runtime.queues import SizedQueue
 
 _IN_FLIGHT = 2
@@ -45,7 +45,7 @@ class Link:
         Args:
             name: Name of the threads.
             limit_bytes: Size of what may wait here.
-            receive: Called with `Ready` and with every answer of a child, as a message, as the
+            receive: Called with `Ready`, `News` and every answer of a child, as a message, as the
                 bytes that it came in and those that it answers, from the reading thread; while it
                 blocks, the child gets no more work.
         """
@@ -199,7 +199,7 @@ class _Line:
             while True:
                 data = self._connection.recv_bytes()
                 message = load(data)
-                if isinstance(message, Ready):
+                if isinstance(message, Ready | News):
                     self.is_ready = True
                     self._receive(message, data, b"")
                     continue

@@ -49,12 +49,18 @@ class ProcessName(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Ready:
-    """A child takes work, or has news by itself; the only message that is no answer."""
+    """A child takes work; like `News` no answer to anything."""
 
-    known: Mapped | None = None
-    """The map, if there is one."""
     first_keyframe: int = 0
     """Keyframes that the map had when the session began."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class News:
+    """What the topology has to tell although it was told nothing."""
+
+    mapped: Mapped
+    """The map as it is, and what has happened to it."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -35,6 +35,7 @@ from hmt_service.runtime.messages import (
     Finished,
     Keeper,
     Mapped,
+    News,
     Part,
     ProcessFailure,
     ProcessName,
@@ -410,12 +411,12 @@ class Pipeline:
         self._listener.on_tracking(tracking)
         self._topology.put(dump(replace(message, memory=None)))
 
-    def _on_topology(self, message: Ready | Mapped, _: bytes, sent: bytes) -> None:
+    def _on_topology(self, message: Ready | News | Mapped, _: bytes, sent: bytes) -> None:
         if isinstance(message, Ready):
             self._session.first_keyframe = message.first_keyframe
             self._recovered(ProcessName.TOPOLOGY)
-            if message.known is not None:
-                self._mapped(message.known, None)
+        elif isinstance(message, News):
+            self._mapped(message.mapped, None)
         else:
             self._mapped(message, sent)
 

@@ -40,6 +40,7 @@ from hmt_service.runtime.messages import (
     Keeper,
     Mapped,
     MapRequest,
+    News,
     Ready,
     RelocalizeRequest,
     Request,
@@ -112,11 +113,12 @@ def run_topology(
     topology = _Topology(config, seed, save, keeper, budget, encode, report, interrupted)
     with closing(topology):
         _send(work, topology.ready())
+        _send(work, topology.news())
         for connection, message in _received(requests, work, idle=topology.rest):
             if connection is requests:
                 results = topology.answer(message)
-                if (news := topology.news()) is not None:
-                    _send(work, news)
+                if topology.has_news:
+                    _send(work, topology.news())
                 for result in results:
                     _send(requests, result)
             elif isinstance(message, Finish):
@@ -151,6 +153,8 @@ class _Topology:
         self._keeper = None if keeper is None or keeper.is_frozen else keeper
         self._stored_keyframes = self._engine.keyframes
         self._stored_scans = self._engine.scans
+        self._is_stale = False
+        self.has_news = False
         self._kept_s = -math.inf
         self._pause_s = _KEEP_S
         self._untold: tuple[Event, ...] = ()
@@ -175,16 +179,15 @@ class _Topology:
             assert tracked.tracking is not None, "only scans are kept"
             self._engine.process(tracked.tracking)
 
-    def ready(self, events: tuple[Event, ...] = ()) -> Ready:
-        """Return what is there to begin with."""
-        snapshot = self._engine.snapshot()
-        known = None if snapshot is None else self._mapped(snapshot, events)
-        return Ready(known, self._engine.first_of_session)
+    def ready(self) -> Ready:
+        """Return what the session begins with."""
+        return Ready(self._engine.first_of_session)
 
-    def news(self) -> Ready | None:
-        """Return what has changed although no scan has come; None for nothing."""
-        events = self._engine.untold()
-        return self.ready(events) if events else None
+    def news(self) -> News:
+        """Return the map, and what has happened to it although no scan has come."""
+        events, self._untold = self._untold, ()
+        self.has_news = False
+        return News(self._mapped(self._engine.snapshot(), events))
 
     def map(self, tracked: Tracked) -> Mapped:
         """Take one scan into the map, unless what it is relative to was thrown away before.
@@ -283,11 +286,11 @@ class _Topology:
                     request.a_from_b,
                     probability=request.probability,
                 )
-                self._keep_now()
+                self._keep_what_was_told()
                 return effect
             case RetractArcRequest():
                 effect = self._engine.retract_arc(request.statement)
-                self._keep_now()
+                self._keep_what_was_told()
                 return effect
             case SaveRequest():
                 if self._save is None and self._keeper is None:
@@ -307,17 +310,18 @@ class _Topology:
             files = (*files, *self._save(self._engine, self._report(), kept))
         return files
 
-    def _keep_now(self) -> None:
+    def _keep_what_was_told(self) -> None:
         """Write the map file with what nobody says twice; if that fails, it is tried again."""
-        self._stored_keyframes = -1
-        self._kept_s = -math.inf
-        self._untold = (*self._untold, *self.keep())
+        self._is_stale, self._kept_s = True, -math.inf
+        self._untold = (*self._untold, *self._engine.untold(), *self.keep())
+        self.has_news = True
 
     def keep(self) -> tuple[Event, ...]:
         """Write the map file if it lacks keyframes, but not all the time; say what went wrong."""
         keeper, started_s = self._keeper, time.monotonic()
         unstored_scans = self._engine.scans - self._stored_scans
-        if self._engine.keyframes == self._stored_keyframes and unstored_scans < _MOST_UNSTORED:
+        has_new = self._engine.keyframes != self._stored_keyframes or self._is_stale
+        if not has_new and unstored_scans < _MOST_UNSTORED:
             return ()
         if keeper is None or self._engine.keyframes == 0:
             return ()
@@ -342,6 +346,7 @@ class _Topology:
 
     def _note_stored(self) -> None:
         self._stored_keyframes, self._stored_scans = self._engine.keyframes, self._engine.scans
+        self._is_stale = False
 
     def _report(self) -> RunReport:
         return RunReport(self._scans, self._odometry_busy_s, self._busy_s, self._stored_keyframes)

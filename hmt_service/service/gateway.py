@@ -35,7 +35,7 @@ from hmt_service.core.types import (
     Snapshot,
     Tracking,
 )
-from hmt_service.errors import DaemonFailure, HmtError, Unavailable
+from hmt_service.errors import DaemonFailure, HmtError, InvalidInput, Unavailable
 from hmt_service.io.ros_messages import RosType
 from hmt_service.runtime.localization import Localizer
 from hmt_service.runtime.messages import (
@@ -476,6 +476,8 @@ class Gateway:
 
 def _statement(question: Question[Control]) -> AssertArcRequest:
     x, y, z, *quaternion, sigma_m, sigma_rad, probability = map(question.needed_number, _NUMBERS)
+    if sigma_m <= 0.0 or sigma_rad <= 0.0:
+        raise InvalidInput(f"standard deviations {sigma_m:g} m, {sigma_rad:g} rad are not above 0")
     pose = pose_of(np.array(quaternion), np.array([x, y, z]))
     covariance = isotropic_covariance(sigma_rad=sigma_rad, sigma_m=sigma_m)
     return AssertArcRequest(
