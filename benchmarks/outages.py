@@ -173,6 +173,7 @@ def _pid_of(status: Status, name: ProcessName) -> int:
 
 
 def _kill(client: HmtClient, pid: int, outages: _Outages) -> None:
+    assert pid > 0, "a process that is not there cannot be killed"
     died_s = time.perf_counter()
     os.kill(pid, signal.SIGKILL)
     with suppress(HmtError):

@@ -175,12 +175,14 @@ class Engine:
             ]
         )
         engine._next_hypothesis = 1 + max(h.hypothesis for h in stored.hypotheses)
-        engine._revision = engine._finished_revision = stored.revision
+        engine._revision = stored.revision
         begun = len(stored.keyframes) if first_of_session is None else first_of_session
         engine._first_of_session = begun
         engine._wakes_up = begun == len(stored.keyframes)
         engine._frozen_visits = len(visits) if is_frozen else 0
-        if not engine._wakes_up:
+        if engine._wakes_up:
+            engine._finished_revision = stored.revision
+        else:
             engine._recall()
         return engine
 
@@ -637,6 +639,11 @@ class Engine:
     def first_of_session(self) -> int:
         """Number of keyframes that the map had when the session began."""
         return self._first_of_session
+
+    @property
+    def wakes_up(self) -> bool:
+        """Whether the robot may be anywhere in the map from the next keyframe on."""
+        return self._wakes_up
 
     @property
     def memory_usage(self) -> MemoryUsage | None:

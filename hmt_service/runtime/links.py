@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from typing import Any
 
-from hmt_service.runtime.messages import News, Part, Ready, Stop, dump, load
+from hmt_service.runtime.messages import Answered, News, Ready, Stop, dump, load
 from hmt_service.runtime.queues import SizedQueue
 
 _IN_FLIGHT = 2
@@ -55,15 +55,19 @@ class Link:
         self._unanswered: deque[_Message] = deque()
         self._suspect: _Message | None = None
         self._line: _Line | None = None
+        self.was_ready = False
+        """Whether the last child that is disconnected had said that it takes work."""
 
-    def connect(self, connection: Connection) -> None:
+    def connect(self, connection: Connection, opening: object = None) -> None:
         """Talk to a child from now on; the one before is gone and disconnected.
 
         Args:
             connection: The parent's end of the pipe, owned from now on.
+            opening: What the child is told first, without an answer; None for nothing.
         """
+        first = () if opening is None else (dump(opening),)
         self._line = _Line(
-            connection, self._name, self._outbox, self._unanswered, receive=self._receive
+            connection, self._name, self._outbox, self._unanswered, first, receive=self._receive
         )
 
     @property
@@ -97,26 +101,26 @@ class Link:
         """Wait for the threads, which end when the child has, and free the pipe."""
         if self._line is not None:
             self._line.join()
+            self.was_ready = self._line.is_ready
             self._line = None
 
-    def take_fatal(self) -> bytes | None:
-        """Take out the message that two children in a row have died of, if there is one.
+    def take_fatal(self) -> Any:
+        """Take out the message that two children in a row have died of; None if there is none.
 
-        To be called once after each of them has died and is disconnected.
+        To be called once after each of them that was ready has died and is disconnected.
         """
         before, self._suspect = self._suspect, None
         if not self._unanswered:
             return None
         if self._unanswered[0] is before:
-            return self._unanswered.popleft().data
+            return load(self._unanswered.popleft().data)
         self._suspect = self._unanswered[0]
         return None
 
-    def take_unanswered(self) -> int:
-        """Forget what the child that is gone has not answered, and return how many messages."""
-        count = len(self._unanswered)
+    def clear(self) -> None:
+        """Throw away all that waits, and what the child that is gone has not answered."""
+        self._outbox.clear()
         self._unanswered.clear()
-        return count
 
     def discard_all(self) -> None:
         """Throw away what waits and what the child that is gone has not answered, tokens apart."""
@@ -145,6 +149,7 @@ class _Line:
         name: str,
         outbox: SizedQueue[_Message | _HungUp],
         unanswered: deque[_Message],
+        first: tuple[bytes, ...],
         *,
         receive: Callable[[Any, bytes, bytes], None],
     ) -> None:
@@ -152,8 +157,8 @@ class _Line:
         self._outbox = outbox
         self._unanswered = unanswered
         self._receive = receive
-        self._again = tuple(unanswered)
-        self._credit = threading.Semaphore(_IN_FLIGHT - len(self._again))
+        self._first = (*first, *(message.data for message in unanswered))
+        self._credit = threading.Semaphore(_IN_FLIGHT - len(unanswered))
         self._hung_up = _HungUp()
         self._is_over = False
         self.is_ready = False
@@ -175,8 +180,8 @@ class _Line:
 
     def _write(self) -> None:
         try:
-            for message in self._again:
-                self._connection.send_bytes(message.data)
+            for data in self._first:
+                self._connection.send_bytes(data)
             while (message_or_end := self._next()) is not None:
                 self._unanswered.append(message_or_end)
                 self._connection.send_bytes(message_or_end.data)
@@ -204,7 +209,7 @@ class _Line:
                     self._receive(message, data, b"")
                     continue
                 self._receive(message, data, self._unanswered[0].data)
-                if isinstance(message, Part) and not message.is_last:
+                if isinstance(message, Answered) and not message.is_last:
                     continue
                 self._unanswered.popleft()
                 self._credit.release()

@@ -76,6 +76,8 @@ class Finish:
     """Grows with every one."""
     is_urgent: bool = False
     """Whether there is no time to smooth the trajectory."""
+    is_last: bool = False
+    """Whether readings behind it wait until they are let go on, for another map."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -127,6 +129,8 @@ class Mapped:
     """How many of them are in the map file, whatever happens now."""
     finished: Finished | None = None
     """Set in the answer to `Finish`."""
+    wakes_up: bool = False
+    """Whether the robot may be anywhere from the next keyframe on."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -296,6 +300,8 @@ Encode = Callable[[Answer], Wire]
 class Asked:
     """A request on its way to the topology process."""
 
+    number: int
+    """Which one it is."""
     request: Request
     """What is asked."""
     deadline_s: float
@@ -337,6 +343,21 @@ def parts_of(whole: Wire, part_bytes: int) -> Iterator[Part]:
 
 Result = Part | tuple[str, ...] | HmtError
 """What comes back: an answer part by part, the names of saved files, or why not."""
+
+
+@dataclass(frozen=True, slots=True)
+class Answered:
+    """A result on its way back."""
+
+    number: int
+    """Of the request."""
+    result: Result
+    """The answer, or a part of it."""
+
+    @property
+    def is_last(self) -> bool:
+        """Whether nothing more comes."""
+        return not isinstance(self.result, Part) or self.result.is_last
 
 
 class Keeper(Protocol):

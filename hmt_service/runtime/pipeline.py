@@ -11,6 +11,7 @@ References:
 
 from __future__ import annotations
 
+import logging
 import multiprocessing
 import os
 import signal
@@ -26,9 +27,10 @@ from typing import TYPE_CHECKING, Protocol
 
 from hmt_service.core.config import Config
 from hmt_service.core.types import Keyframe, Reading, Tracking
-from hmt_service.errors import DeadlineExceeded, Unavailable
+from hmt_service.errors import DeadlineExceeded, HmtError, Unavailable
 from hmt_service.runtime.links import Link
 from hmt_service.runtime.messages import (
+    Answered,
     Asked,
     Encode,
     Finish,
@@ -44,16 +46,17 @@ from hmt_service.runtime.messages import (
     Request,
     Result,
     Save,
+    Stop,
     Tracked,
     dump,
-    load,
 )
-from hmt_service.runtime.recovery import Session, TrackedBefore
+from hmt_service.runtime.recovery import MappedBefore, Session, TrackedBefore
 from hmt_service.runtime.workers import run_odometry, run_topology
 
 if TYPE_CHECKING:
     from hmt_service.core.visits import MemoryBudget
 
+_LOG = logging.getLogger(__name__)
 _READINGS_BYTES = 4_000_000
 """Readings that wait for the odometry here; the rest wait, still encoded, at the input."""
 _TRACKINGS_BYTES = 256_000_000
@@ -61,6 +64,8 @@ _TRACKINGS_BYTES = 256_000_000
 _MAX_REQUESTS = 32
 """Requests that may wait for the topology."""
 _GRACE_S = 1.0
+_STOP_S = 5.0
+"""Time for a topology to leave its map file at rest before another map is loaded."""
 _MOST_STILLBORN = 3
 """Processes in a row that may die before they are ready; then another one would, too."""
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -137,7 +142,8 @@ class Pipeline:
         self._window: deque[Keyframe] = deque(maxlen=config.odometry.window_keyframes)
         self._session = Session()
         self._tracked_scans = 0
-        self._pending: deque[_Pending] = deque()
+        self._pending: dict[int, _Pending] = {}
+        self._asked = 0
         self._pending_lock = threading.Lock()
         self._odometry = Link("odometry", limit_bytes=_READINGS_BYTES, receive=self._on_odometry)
         self._topology = Link("topology", limit_bytes=_TRACKINGS_BYTES, receive=self._on_topology)
@@ -155,32 +161,30 @@ class Pipeline:
 
     def _start(self, name: ProcessName, *, is_resumed: bool) -> None:
         """Start a process, which goes on where the one before it was, or begins a new session."""
-        target: Callable[..., None]
-        args: tuple[object, ...]
-        match name:
-            case ProcessName.ODOMETRY:
-                target, args = run_odometry, (self._config, self._tracked_before(is_resumed))
-            case _:
-                interrupted = self._session.interrupted if is_resumed else None
-                target = run_topology
-                args = (
-                    *(self._config, self._seed, self._save, self._keeper, self._budget),
-                    *(self._encode, self._session.report, interrupted),
-                )
+        target: Callable[..., None] = run_odometry
+        args: tuple[object, ...] = (self._config,)
+        before: object = self._tracked_before(is_resumed=is_resumed)
+        if name is ProcessName.TOPOLOGY:
+            target, args = run_topology, (*args, self._seed, self._save, self._keeper)
+            args = (*args, self._budget, self._encode)
+            interrupted = self._session.interrupted if is_resumed else None
+            before = MappedBefore(self._session.report, interrupted)
         context = multiprocessing.get_context("spawn")
         child = self._children[name]
         pipes = [context.Pipe() for _ in child.links]
         theirs = [end for _, end in pipes]
+        # Few arguments: who starts a process waits until it has read them, or for ever.
         process = context.Process(target=target, args=(*theirs, *args), name=f"hmt-{name}")
         with _one_thread_per_library():
             process.start()
         child.process = process
-        for link, (ours, end) in zip(child.links, pipes, strict=True):
+        openings = [before, *([None] * len(child.links))]
+        for link, (ours, end), opening in zip(child.links, pipes, openings, strict=False):
             # A child's death ends a pipe only when nobody else holds that end.
             end.close()
-            link.connect(ours)
+            link.connect(ours, opening)
 
-    def _tracked_before(self, is_resumed: bool) -> TrackedBefore:
+    def _tracked_before(self, *, is_resumed: bool) -> TrackedBefore:
         progress = self._progress
         if not is_resumed:
             return TrackedBefore(processed=progress.processed, busy_s=progress.busy_s)
@@ -192,6 +196,14 @@ class Pipeline:
 
         Readings wait meanwhile. Not to be called while another thread watches.
         """
+        topology = self._children[ProcessName.TOPOLOGY].process
+        if topology is not None:
+            # It leaves its file at rest.
+            self._topology.clear()
+            self._topology.put_token(Stop())
+            topology.join(_STOP_S)
+            self._bury(ProcessName.TOPOLOGY)
+            self._topology.clear()
         self._end_session()
 
     def begin(self, keeper: Keeper | None) -> None:
@@ -267,10 +279,11 @@ class Pipeline:
         pending = _Pending(on_result, time.monotonic() + timeout_s)
         with self._pending_lock:
             waiting = len(self._pending)
-            asked = Asked(request, pending.deadline_s, part_bytes)
+            number = self._asked = self._asked + 1
+            asked = Asked(number, request, pending.deadline_s, part_bytes)
             is_taken = waiting < _MAX_REQUESTS and self._requests.put_token(asked)
             if is_taken:
-                self._pending.append(pending)
+                self._pending[number] = pending
         if not is_taken:
             on_result(Unavailable(f"the topology process takes no request, {waiting} wait for it"))
 
@@ -278,7 +291,7 @@ class Pipeline:
         """Answer the requests whose time is over."""
         now = time.monotonic()
         with self._pending_lock:
-            late = [p for p in self._pending if p.deadline_s < now]
+            late = [p for p in self._pending.values() if p.deadline_s < now]
         for pending in late:
             self._answer(pending, DeadlineExceeded("no answer of the topology process in time"))
 
@@ -288,17 +301,16 @@ class Pipeline:
         Returns:
             What is wrong if that is of no use any more; None otherwise.
         """
-        processes = [child.process for child in self._children.values() if child.process]
-        is_over = bool(wait([process.sentinel for process in processes], timeout_s))
-        for name, child in self._children.items():
-            process = child.process
-            if process is None:
+        alive = {c.process.sentinel: c for c in self._children.values() if c.process is not None}
+        over = wait(list(alive), timeout_s)
+        ended = [child for sentinel, child in alive.items() if sentinel in over]
+        # The odometry may wait for room at the topology: that one first.
+        for name in (ProcessName.TOPOLOGY, ProcessName.ODOMETRY):
+            child = self._children[name]
+            process, is_broken = child.process, any(link.is_broken for link in child.links)
+            if process is None or not (child in ended or is_broken):
                 continue
-            is_broken = any(link.is_broken for link in child.links)
-            if is_over or is_broken:
-                process.join(_GRACE_S)  # a pipe ends a moment before its process
-            if process.is_alive() and not is_broken:
-                continue
+            process.join(_GRACE_S)  # a pipe ends a moment before its process
             failure = ProcessFailure(name, process.pid or 0, _reason(process.exitcode))
             if not self._replace(name, failure):
                 return failure
@@ -306,49 +318,62 @@ class Pipeline:
 
     def _replace(self, name: ProcessName, failure: ProcessFailure) -> bool:
         """Start a process in the place of one that died; return whether that makes sense."""
-        child = self._children[name]
-        child.stillborn = 0 if child.links[0].is_ready else child.stillborn + 1
+        child, is_topology = self._children[name], name is ProcessName.TOPOLOGY
         child.died_s = child.died_s or time.monotonic()
         self._bury(name)
+        fatal = None
+        if child.links[0].was_ready:
+            child.stillborn, fatal = 0, child.links[0].take_fatal()
+        else:
+            child.stillborn += 1
         if child.stillborn >= _MOST_STILLBORN:
             for link in child.links:
                 link.abandon()
             return False
-        fatal = child.links[0].take_fatal()
         if fatal is not None:
             reason = f"{failure.reason} as the one before, of the same message, which is left out"
             failure = replace(failure, reason=reason)
-        is_topology = name is ProcessName.TOPOLOGY
         # Who is killed while it starts has tried nothing yet; twice, and what it is to go on with
         # may be the reason.
         is_over = child.stillborn > 1 or (
-            is_topology and (fatal is not None or self._session.interrupted is None)
+            is_topology and (fatal is not None or not self._session.can_go_on)
         )
         if is_over:
             self._end_session()
         self._listener.on_failure(failure, is_session_over=is_over)
-        if is_topology and fatal is not None and isinstance(message := load(fatal), Finish):
-            self._fail(message, failure)
-        for each in self._children:
-            if each is name or is_over:
-                self._start(each, is_resumed=not is_over)
+        if isinstance(fatal, Finish):
+            self._fail(fatal, failure)
         child.restarts += 1
+        try:
+            for each in self._children:
+                if each is name or is_over:
+                    self._start(each, is_resumed=not is_over)
+        except OSError as error:
+            _LOG.error("no process %s can be started: %s", name, error)
+            return False
         return True
 
     def _bury(self, name: ProcessName) -> None:
         """Make sure that a process is gone, and answer those who wait for it alone."""
-        child = self._children[name]
+        child, gone = self._children[name], Unavailable("the topology process is gone: ask again")
         if child.process is not None:
             child.process.kill()
             child.process.join()
             child.process = None
+        if name is ProcessName.TOPOLOGY:
+            # First: who takes an answer slowly would be waited for.
+            self._fail_requests(gone)
         for link in child.links:
             link.disconnect()
         if name is ProcessName.TOPOLOGY:
-            with self._pending_lock:
-                lost = [self._pending.popleft() for _ in range(self._requests.take_unanswered())]
-            for one in lost:
-                self._answer(one, Unavailable("the topology process died while it worked on this"))
+            self._requests.clear()
+            self._fail_requests(gone)
+
+    def _fail_requests(self, error: HmtError) -> None:
+        with self._pending_lock:
+            waiting, self._pending = list(self._pending.values()), {}
+        for pending in waiting:
+            self._answer(pending, error)
 
     def _end_session(self) -> None:
         """Forget what only the processes that are gone could go on with."""
@@ -386,12 +411,11 @@ class Pipeline:
                 child.process.kill()
                 child.process.join()
                 killed.append(name)
+        self._fail_requests(Unavailable("the daemon is stopping"))
+        self._topology.abandon()
+        for child in self._children.values():
             for link in child.links:
                 link.disconnect()
-        with self._pending_lock:
-            pending = list(self._pending)
-        for one in pending:
-            self._answer(one, Unavailable("the daemon is stopping"))
         return tuple(killed)
 
     def _on_odometry(self, message: Ready | Tracked | Finish, _: bytes, __: bytes) -> None:
@@ -430,19 +454,27 @@ class Pipeline:
         if died_s is not None:
             self._listener.on_recovery(name, time.monotonic() - died_s)
 
-    def _on_result(self, message: Result, _: bytes, __: bytes) -> None:
+    def _on_result(self, message: Answered, _: bytes, __: bytes) -> None:
         with self._pending_lock:
-            is_over = not isinstance(message, Part) or message.is_last
-            pending = self._pending.popleft() if is_over else self._pending[0]
-        self._answer(pending, message)
+            pending = self._pending.get(message.number)
+        if pending is not None:
+            self._answer(pending, message.result)
+        if message.is_last:
+            with self._pending_lock:
+                self._pending.pop(message.number, None)
 
     def _answer(self, pending: _Pending, result: Result) -> None:
         with self._pending_lock:
             on_result = pending.on_result
-            if not isinstance(result, Part) or result.is_last:
+            # Who takes a part slowly must still learn that its time is over.
+            if not isinstance(result, Part):
                 pending.on_result = None
-        if on_result is not None:
+        if on_result is None:
+            return
+        try:
             on_result(result)
+        except Exception:  # noqa: BLE001 - whatever is wrong with one client, others wait, too
+            _LOG.exception("an answer could not be passed on")
 
     def _status(
         self, name: ProcessName, link: Link, processed: int, busy_s: float

@@ -85,6 +85,13 @@ class SizedQueue(Generic[T]):
             self._changed.notify_all()
             return count
 
+    def clear(self) -> None:
+        """Throw away all items, tokens too."""
+        with self._changed:
+            self._items.clear()
+            self._bytes = self._tokens = 0
+            self._changed.notify_all()
+
     def close(self) -> None:
         """Take nothing more; what waits can still be taken out."""
         with self._changed:

@@ -42,20 +42,34 @@ class Interrupted:
     """Scans that the map had in the end, of all sessions."""
     journal: tuple[bytes, ...]
     """The latest of these as `Tracked` messages, in order."""
+    wakes_up: bool
+    """Whether the robot may be anywhere from the next keyframe on."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MappedBefore:
+    """What the topology has done so far."""
+
+    report: RunReport
+    """What it has cost."""
+    interrupted: Interrupted | None
+    """The session that it goes on with; None to begin one."""
 
 
 @dataclass(slots=True)
 class Session:
     """What the topology has done since the odometry began, as far as it is not in the map file."""
 
-    first_keyframe: int = 0
-    """Keyframes that the map had when the session began."""
+    first_keyframe: int | None = None
+    """Keyframes that the map had when the session began; None as long as it has not."""
     known_scans: int = 0
     """Scans in the map, of all sessions."""
     report: RunReport = field(default_factory=lambda: RunReport(0, 0.0, 0.0))
     """What the daemon has cost so far."""
     stored_scans: int = 0
     """How many of them are in the map file at least."""
+    wakes_up: bool = False
+    """Whether the robot may be anywhere from the next keyframe on."""
     _journal: deque[bytes] = field(default_factory=deque)
     _journal_bytes: int = 0
 
@@ -66,7 +80,7 @@ class Session:
             told: What the topology was told; None if it spoke by itself.
             mapped: What it said.
         """
-        self.report = mapped.report
+        self.report, self.wakes_up = mapped.report, mapped.wakes_up
         known_scans, stored_scans = mapped.known_scans, mapped.stored_scans
         if told is not None and known_scans > self.known_scans:
             self._journal.append(told)
@@ -78,8 +92,14 @@ class Session:
             self._journal_bytes -= len(self._journal.popleft())
 
     @property
+    def can_go_on(self) -> bool:
+        """Whether another engine can; not if too much was neither stored nor kept."""
+        return len(self._journal) >= self.known_scans - self.stored_scans
+
+    @property
     def interrupted(self) -> Interrupted | None:
-        """What another engine needs to go on; None if too much was neither stored nor kept."""
-        if len(self._journal) < self.known_scans - self.stored_scans:
+        """What another engine needs to go on; None if it is to begin."""
+        if self.first_keyframe is None:
             return None
-        return Interrupted(self.first_keyframe, self.known_scans, tuple(self._journal))
+        known, journal = self.known_scans, tuple(self._journal)
+        return Interrupted(self.first_keyframe, known, journal, self.wakes_up)

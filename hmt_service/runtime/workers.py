@@ -30,6 +30,7 @@ from hmt_service.errors import (
 )
 from hmt_service.runtime.messages import (
     Answer,
+    Answered,
     AreaRequest,
     Asked,
     AssertArcRequest,
@@ -60,7 +61,7 @@ from hmt_service.runtime.messages import (
 
 if TYPE_CHECKING:
     from hmt_service.core.visits import MemoryBudget
-    from hmt_service.runtime.recovery import Interrupted, TrackedBefore
+    from hmt_service.runtime.recovery import Interrupted, MappedBefore, TrackedBefore
 
 _LOG = logging.getLogger(__name__)
 # The map file is written this often, and takes no larger share of the time.
@@ -74,11 +75,12 @@ _MOST_WHOLE_BYTES = 8_000_000
 T = TypeVar("T")
 
 
-def run_odometry(work: Connection, config: Config, before: TrackedBefore) -> None:
+def run_odometry(work: Connection, config: Config) -> None:
     """Turn readings into trackings until the pipe ends."""
     _leave_signals_to_parent()
     from hmt_service.core.odometry import Odometry
 
+    before: TrackedBefore = _opening(work)
     if before.memory is None:
         odometry = Odometry(config)
     else:
@@ -105,26 +107,33 @@ def run_topology(
     keeper: Keeper | None,
     budget: MemoryBudget | None,
     encode: Encode,
-    report: RunReport,
-    interrupted: Interrupted | None,
 ) -> None:
     """Turn trackings into the map until the pipes end, and answer requests between two scans."""
     _leave_signals_to_parent()
-    topology = _Topology(config, seed, save, keeper, budget, encode, report, interrupted)
+    before: MappedBefore = _opening(work)
+    topology = _Topology(config, seed, save, keeper, budget, encode, before)
+
+    def keep() -> None:
+        # What is in the file must be what the parent knows to be in the map: after the answer.
+        topology.keep()
+        if topology.has_news:
+            _send(work, topology.news())
+
     with closing(topology):
         _send(work, topology.ready())
         _send(work, topology.news())
-        for connection, message in _received(requests, work, idle=topology.rest):
+        for connection, message in _received(requests, work, idle=keep):
             if connection is requests:
                 results = topology.answer(message)
                 if topology.has_news:
                     _send(work, topology.news())
                 for result in results:
-                    _send(requests, result)
+                    _send(requests, Answered(message.number, result))
             elif isinstance(message, Finish):
                 _send(work, topology.finish(message))
             else:
                 _send(work, topology.map(message))
+                keep()
 
 
 class _Topology:
@@ -138,11 +147,11 @@ class _Topology:
         keeper: Keeper | None,
         budget: MemoryBudget | None,
         encode: Encode,
-        report: RunReport,
-        interrupted: Interrupted | None,
+        before: MappedBefore,
     ) -> None:
         from hmt_service.core.engine import Engine
 
+        report, interrupted = before.report, before.interrupted
         if keeper is None:
             self._engine = Engine(config, seed=seed, budget=budget)
         else:
@@ -178,6 +187,8 @@ class _Topology:
             tracked: Tracked = load(data)
             assert tracked.tracking is not None, "only scans are kept"
             self._engine.process(tracked.tracking)
+        if interrupted.wakes_up:
+            self._engine.relocalize()
 
     def ready(self) -> Ready:
         """Return what the session begins with."""
@@ -202,14 +213,9 @@ class _Topology:
         self._busy_s += time.perf_counter() - started
         self._scans += 1
         self._odometry_busy_s = tracked.busy_s
-        events = (*events, *self._untold, *self.keep())
-        self._untold = ()
+        events, self._untold = (*events, *self._untold), ()
         has_changed = tracked.tracking.keyframe is not None or bool(events)
         return self._mapped(self._engine.snapshot() if has_changed else None, events)
-
-    def rest(self) -> None:
-        """Write the map file while nothing comes; what went wrong is told with the next answer."""
-        self._untold = (*self._untold, *self.keep())
 
     def finish(self, finish: Finish) -> Mapped:
         """Complete the map and save it."""
@@ -278,6 +284,7 @@ class _Topology:
                 )
             case RelocalizeRequest():
                 self._engine.relocalize()
+                self.has_news = True
                 return ()
             case AssertArcRequest():
                 effect = self._engine.assert_arc(
@@ -313,31 +320,34 @@ class _Topology:
     def _keep_what_was_told(self) -> None:
         """Write the map file with what nobody says twice; if that fails, it is tried again."""
         self._is_stale, self._kept_s = True, -math.inf
-        self._untold = (*self._untold, *self._engine.untold(), *self.keep())
+        self._untold = (*self._untold, *self._engine.untold())
         self.has_news = True
+        self.keep()
 
-    def keep(self) -> tuple[Event, ...]:
-        """Write the map file if it lacks keyframes, but not all the time; say what went wrong."""
+    def keep(self) -> None:
+        """Write the map file if it lacks keyframes, but not all the time; then there is news."""
         keeper, started_s = self._keeper, time.monotonic()
         unstored_scans = self._engine.scans - self._stored_scans
         has_new = self._engine.keyframes != self._stored_keyframes or self._is_stale
         if not has_new and unstored_scans < _MOST_UNSTORED:
-            return ()
+            return
         if keeper is None or self._engine.keyframes == 0:
-            return ()
+            return
         if started_s - self._kept_s < self._pause_s:
-            return ()
+            return
         failed = _guarded(lambda: keeper.write(self._engine))
         self._kept_s = time.monotonic()
         self._pause_s = max(_KEEP_S, (self._kept_s - started_s) / _KEEP_SHARE)
+        self.has_news = True
         if failed is None:
             self._note_stored()
-            return ()
+            return
         keyframes, stored = float(self._engine.keyframes), float(self._stored_keyframes)
         numbers = {"keyframes": keyframes, "stored": stored}
         snapshot = self._engine.snapshot()
         stamp_s = 0.0 if snapshot is None else snapshot.posterior.stamp_s
-        return (Event(EventKind.NOT_SAVED, stamp_s, str(failed), numbers),)
+        event = Event(EventKind.NOT_SAVED, stamp_s, str(failed), numbers)
+        self._untold = (*self._untold, event)
 
     def close(self) -> None:
         """Leave the map file at rest."""
@@ -358,7 +368,8 @@ class _Topology:
         finished: Finished | None = None,
     ) -> Mapped:
         scans, stored = self._engine.scans, self._stored_scans
-        return Mapped(snapshot, events, self._report(), scans, stored, finished)
+        wakes_up = self._engine.wakes_up
+        return Mapped(snapshot, events, self._report(), scans, stored, finished, wakes_up)
 
 
 def _guarded(answer: Callable[[], T]) -> T | HmtError:
@@ -372,6 +383,14 @@ def _guarded(answer: Callable[[], T]) -> T | HmtError:
     except Exception as error:  # noqa: BLE001 - whatever it is, the map is still there
         _LOG.exception("a request failed")
         return DaemonFailure(f"the request failed: {error!r}")
+
+
+def _opening(connection: Connection) -> Any:
+    """Return what the parent says first."""
+    try:
+        return load(connection.recv_bytes())
+    except (EOFError, OSError) as error:
+        raise SystemExit from error  # the parent is gone
 
 
 def _leave_signals_to_parent() -> None:

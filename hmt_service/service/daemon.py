@@ -6,6 +6,7 @@ References:
 
 from __future__ import annotations
 
+import logging
 import time
 from collections import deque
 from collections.abc import Callable
@@ -19,14 +20,7 @@ import zenoh
 from hmt_service.core.config import Config
 from hmt_service.core.types import Event, EventKind
 from hmt_service.errors import DaemonFailure, HmtError, InvalidInput, Unavailable
-from hmt_service.runtime.messages import (
-    Finished,
-    ProcessFailure,
-    ProcessName,
-    Result,
-    Save,
-    SaveRequest,
-)
+from hmt_service.runtime.messages import Finished, ProcessFailure, ProcessName, Save
 from hmt_service.runtime.pipeline import Pipeline
 from hmt_service.service.codec import encode
 from hmt_service.service.gateway import Gateway, MapChange
@@ -40,14 +34,13 @@ from hmt_service.service.session import Endpoints, open_session
 if TYPE_CHECKING:
     from hmt_service.core.visits import MemoryBudget
 
+_LOG = logging.getLogger(__name__)
 _TICK_S = 0.1
 _POLL_S = 0.02
 _DRAIN_S = 3.0
 """Time for the input that waits when the daemon is told to stop."""
 _SAVE_S = 4.2
 """Time, from the same moment, after which the map is given up."""
-_CHANGE_S = 30.0
-"""Time to save a map before another one is loaded."""
 _GRACE_S = 0.3
 """Time for a process to end by itself."""
 
@@ -168,41 +161,47 @@ class Daemon:
         return None
 
     def _change_map(self, change: MapChange, gateway: Gateway, pipeline: Pipeline) -> None:
-        """Save the map, and go on with another one; or say why not."""
+        """Complete and save the map, and go on with another one; or say why not."""
         try:
-            keeper, files = self._next_keeper(change.name), self._saved(gateway, pipeline)
-            pipeline.end()
-            try:
-                if change.name is None and keeper is not None:
-                    files = keeper.set_aside()
-                self._keeper = keeper
-            finally:
-                pipeline.begin(self._keeper)
+            change.answer(self._changed(change, gateway, pipeline))
         except HmtError as error:
             change.answer(error)
-            return
-        change.answer(files)
+        except Exception as error:  # noqa: BLE001 - no operator's wish may cost the daemon
+            _LOG.exception("another map was not begun")
+            change.answer(DaemonFailure(f"another map was not begun: {error!r}"))
+        finally:
+            gateway.go_on()
 
-    def _saved(self, gateway: Gateway, pipeline: Pipeline) -> tuple[str, ...]:
-        """Have the map saved, if it is saved anywhere, and return the files.
+    def _changed(self, change: MapChange, gateway: Gateway, pipeline: Pipeline) -> tuple[str, ...]:
+        keeper, files = self._next_keeper(change.name), self._finished(gateway, pipeline)
+        pipeline.end()
+        try:
+            if change.name is None and keeper is not None:
+                files = keeper.set_aside()
+            self._keeper = keeper
+        finally:
+            pipeline.begin(self._keeper)
+        return files
+
+    def _finished(self, gateway: Gateway, pipeline: Pipeline) -> tuple[str, ...]:
+        """Have all that has arrived in the map, and the map saved; return the files.
 
         Raises:
             HmtError: If it is not.
         """
-        is_kept = self._keeper is not None or self._settings.save is not None
-        if not is_kept or gateway.status().keyframes == 0:
-            return ()
-        saved: Future[Result] = Future()
-        pipeline.request(SaveRequest(), saved.set_result, timeout_s=_CHANGE_S)
-        while not wait([saved], timeout=_TICK_S).done:
-            pipeline.tick()
-            if not pipeline.is_alive(ProcessName.TOPOLOGY):
-                raise Unavailable("the topology process died: the map stays")
-        files = saved.result()
-        if isinstance(files, HmtError):
-            raise files
-        assert isinstance(files, tuple), "a map is not saved in parts"
-        return files
+        future: Future[Finished] = Future()
+        gateway.finish(future.set_result, is_urgent=True, is_last=True)
+        while not wait([future], timeout=0.0).done:
+            if self._reason is not None:
+                raise Unavailable("the daemon is stopping")
+            if (failure := pipeline.watch(_TICK_S) or gateway.failure()) is not None:
+                raise Unavailable(str(failure))
+            gateway.tick()
+        finished = future.result()
+        # Where there is no map there is nothing to save.
+        if finished.failure is not None and gateway.status().keyframes > 0:
+            raise DaemonFailure(finished.failure)
+        return finished.files
 
     def _next_keeper(self, name: str | None) -> KeptMap | None:
         """Return the owner of the map to go on with; None for a name: of an empty one."""
@@ -214,16 +213,17 @@ class Daemon:
         if keeper is None:
             raise InvalidInput("the daemon has no map file, and no folder of maps to load from")
         other = keeper.beside(name)
-        if other.path == keeper.path:
+        if other.path.resolve() == keeper.path.resolve():
             raise InvalidInput(f"{name} is the map that the daemon goes on with already")
-        if other.settings() != self._settings.config:
-            raise InvalidInput(f"{name} was made with other settings: start a daemon with it")
+        other.require(self._settings.config)
         return other
 
     def _stop(
         self, gateway: Gateway, pipeline: Pipeline, failure: ProcessFailure | None
     ) -> StopReport:
         gateway.close_input()
+        while self._changes:
+            self._changes.popleft().answer(Unavailable("the daemon is stopping"))
         if failure is not None:
             gateway.publish([Event(EventKind.PROCESS_FAILED, gateway.stamp_s, str(failure))])
         finished = _finish(gateway, pipeline, is_broken=failure is not None)

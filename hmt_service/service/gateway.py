@@ -16,7 +16,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -208,17 +208,28 @@ class Gateway:
             self._reported_s = now
             self._report_refused()
 
-    def finish(self, on_finished: Callable[[Finished], None], *, is_urgent: bool = False) -> None:
+    def finish(
+        self,
+        on_finished: Callable[[Finished], None],
+        *,
+        is_urgent: bool = False,
+        is_last: bool = False,
+    ) -> None:
         """Process what has arrived, complete the map and save it; input may follow.
 
         Args:
             on_finished: Called once with the outcome, from any thread.
             is_urgent: Whether there is no time to smooth the trajectory.
+            is_last: Whether what follows waits for `go_on`.
         """
         with self._lock:
             self._finishes += 1
             self._on_finished[self._finishes] = on_finished
-            self._intake.finish(Finish(self._finishes, is_urgent))
+            self._intake.finish(Finish(self._finishes, is_urgent, is_last))
+
+    def go_on(self) -> None:
+        """Let the input go on that waits for another map."""
+        self._intake.go_on()
 
     def finish_map(self) -> None:
         """Do the same with the scans that the topology has: nothing comes through the odometry."""
@@ -290,6 +301,8 @@ class Gateway:
     def on_session_over(self) -> None:
         """Forget the map and where the robot is in it."""
         self._snapshot = None
+        self._changes += 1
+        self._report = replace(self._report, stored_keyframes=0)
         self._localizer.forget()
 
     def on_recovery(self, name: ProcessName, outage_s: float) -> None:
@@ -419,6 +432,8 @@ class Gateway:
                 return self._ask(question, _statement(question))
             case Control.RETRACT_ARC:
                 return self._ask(question, RetractArcRequest(question.needed_integer("statement")))
+            case Control.LOAD | Control.RESET if self._is_stopping:
+                raise Unavailable("the daemon is stopping")
             case Control.LOAD | Control.RESET:
                 name = question.text("map") if question.name is Control.LOAD else None
                 self._change_map(MapChange(name, lambda result: self._answer(question, result)))
@@ -437,21 +452,22 @@ class Gateway:
         return wire
 
     def _latest(self, call: Call) -> Value:
+        pose, snapshot = self._localizer.pose, self._snapshot
         match call:
             case Call.STATUS:
                 return self.status()
             case Call.EVENTS:
                 return self._audit.events
             case Call.HISTORY:
-                revision = self._snapshot.posterior.revision if self._snapshot else 0
+                revision = snapshot.posterior.revision if snapshot else 0
                 return History(revision, self._audit.beliefs)
-            case Call.HYPOTHESES if self._snapshot is not None:
-                posterior = self._snapshot.posterior
+            case Call.HYPOTHESES if snapshot is not None:
+                posterior = snapshot.posterior
                 return Hypotheses(posterior.stamp_s, posterior.revision, posterior.hypotheses)
-            case Call.POSE if self._localizer.pose is not None:
-                return self._localizer.pose
-            case Call.POSTERIOR if self._snapshot is not None:
-                return self._snapshot.posterior
+            case Call.POSE if pose is not None:
+                return pose
+            case Call.POSTERIOR if snapshot is not None:
+                return snapshot.posterior
         received = self._intake.counts().received
         raise Unavailable(f"no {call} yet: the map has no keyframe, {received} samples received")
 

@@ -77,6 +77,7 @@ class Intake:
         self._window = ReorderWindow(limits.reorder_s)
         self._thread = threading.Thread(target=self._pump, name="intake", daemon=True)
         self._lock = threading.Lock()
+        self._may_go_on = threading.Event()
         self._is_closed = False
         self._is_stopped = False
         self._received = 0
@@ -122,6 +123,10 @@ class Intake:
         """Hand on what has arrived without waiting for earlier readings, and `finish` behind it."""
         self._queue.put_token(finish)
 
+    def go_on(self) -> None:
+        """Let what waits behind the last reading of a map go on."""
+        self._may_go_on.set()
+
     def close(self) -> None:
         """Refuse every sample from now on; what has arrived is still handed on."""
         with self._lock:
@@ -130,6 +135,7 @@ class Intake:
     def stop(self) -> None:
         """End when all that has arrived is handed on."""
         self.close()
+        self.go_on()
         with self._lock:
             self._is_stopped = True
             self._queue.put_token(_Stop())
@@ -163,7 +169,10 @@ class Intake:
             for reading in self._released_by(item):
                 self._submit(reading)
             if isinstance(item, Finish):
+                self._may_go_on.clear()
                 self._finish(item)
+                if item.is_last:
+                    self._may_go_on.wait()
             elif isinstance(item, _Stop):
                 return
 

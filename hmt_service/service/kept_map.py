@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING
 
 from hmt_service.core.config import Config
 from hmt_service.errors import InvalidInput, NotFound, Unavailable
-from hmt_service.io.map_file import read_config
 from hmt_service.io.map_store import MapStore, bring_to_rest
 
 if TYPE_CHECKING:
@@ -52,14 +51,24 @@ class KeptMap:
             raise InvalidInput(f"map={name[:80]!r} is not the name of a file, such as site.hmt")
         return KeptMap(self.path.parent / name, is_frozen=self.is_frozen)
 
-    def settings(self) -> Config:
-        """Return the settings of the map in the file.
+    def require(self, config: Config) -> None:
+        """Make sure that a map of some settings can be gone on with.
 
         Raises:
             NotFound: If there is no such file.
-            InvalidInput: If it is no map file, is damaged or was written by another version.
+            InvalidInput: If it is no map file, is damaged, empty, has other settings or was written
+                by another version.
+            Unavailable: If it cannot be read now.
         """
-        return read_config(self.path)
+        with MapStore(self.path).reading() as stored:
+            if stored is None:
+                raise NotFound(f"map file {self.path} does not exist")
+            if not stored.visits or not stored.hypotheses:
+                raise InvalidInput(f"map file {self.path} is empty")
+            if stored.config != config:
+                raise InvalidInput(
+                    f"{self.path.name} was made with other settings: start a daemon with it"
+                )
 
     def set_aside(self) -> tuple[str, ...]:
         """Give the file, which nobody writes any more, another name; return it if there is a file.
@@ -67,18 +76,16 @@ class KeptMap:
         Raises:
             Unavailable: If the file system refuses.
         """
-        if not self.path.exists():
+        path = self.path.resolve()  # where the path is a link, the link stays
+        if not path.exists():
             return ()
-        stem, suffix = self.path.stem, self.path.suffix
-        for number in count(1):
-            aside = self.path.with_name(f"{stem}-{number}{suffix}")
-            if not aside.exists():
-                break
+        names = (path.with_name(f"{path.stem}-{number}{path.suffix}") for number in count(1))
+        aside = next(name for name in names if not name.exists())
         try:
-            bring_to_rest(self.path)
-            self.path.rename(aside)
+            bring_to_rest(path)
+            path.rename(aside)
         except (OSError, sqlite3.Error) as error:
-            raise Unavailable(f"{self.path} is not set aside: {error}") from error
+            raise Unavailable(f"{path} is not set aside: {error}") from error
         return (str(aside),)
 
     def engine(

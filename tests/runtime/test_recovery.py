@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 import signal
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -16,15 +17,17 @@ from hmt_service.core.engine import Engine
 from hmt_service.core.geometry import FloatArray, identity
 from hmt_service.core.odometry import Odometry
 from hmt_service.core.types import GlobalMap, MapMethod, Reading, Scan, Tracking
-from hmt_service.errors import Unavailable
 from hmt_service.io.map_file import read_map
 from hmt_service.runtime.messages import (
     Finish,
     Finished,
     Mapped,
     MapRequest,
+    Part,
     ProcessFailure,
     ProcessName,
+    RelocalizeRequest,
+    Result,
     RunReport,
     SaveRequest,
     dump,
@@ -35,6 +38,7 @@ from hmt_service.runtime.pipeline import Pipeline
 from hmt_service.runtime.recovery import Session
 from hmt_service.service.kept_map import KeptMap
 from tests.flat import SETTINGS, readings
+from tests.mapped import map_file_in
 from tests.runtime.harness import DEADLINE_S, Answers, Recorder, Running, encode
 
 SCANS = 160
@@ -196,11 +200,9 @@ def test_who_waits_for_an_answer_learns_that_there_is_none(running: Running) -> 
     kill(running, ProcessName.TOPOLOGY)
     watched(running)
     answers = [one.wait() for one in asked]
-    assert [str(a) for a in answers[:2]] == [
-        "the topology process died while it worked on this"
-    ] * 2
-    assert all(isinstance(answer, Unavailable) for answer in answers[:2])
-    assert answers[2:] == [("20 of 20 scans",)] * 2
+    # None is asked of another map, should there be one then.
+    assert [str(answer) for answer in answers] == ["the topology process is gone: ask again"] * 4
+    assert Answers(running.pipeline, SaveRequest()).wait() == ("20 of 20 scans",)
 
 
 def test_a_reading_that_kills_the_odometry_twice_is_left_out(running: Running) -> None:
@@ -264,7 +266,7 @@ def journal_of(session: Session) -> tuple[bytes, ...]:
 
 
 def test_a_session_keeps_what_is_not_stored() -> None:
-    session = Session()
+    session = Session(first_keyframe=0)
     session.note(None, mapped(10, 10))
     for scan in (b"a", b"b", b"c"):
         session.note(scan, mapped(session.known_scans + 1, 10))
@@ -277,13 +279,13 @@ def test_a_session_keeps_what_is_not_stored() -> None:
 
 
 def test_a_session_of_which_too_much_is_not_stored_cannot_be_gone_on_with() -> None:
-    session, scan = Session(), bytes(1_000_000)
+    session, scan = Session(first_keyframe=0), bytes(1_000_000)
     for number in range(70):
         session.note(scan, mapped(number + 1, 0))
-    assert session.interrupted is None
+    assert not session.can_go_on
     session.note(scan, mapped(71, 70))
-    assert session.interrupted is not None
-    assert len(session.interrupted.journal) == 1
+    assert session.can_go_on
+    assert len(journal_of(session)) == 1
 
 
 def test_input_is_taken_while_a_process_is_replaced(running: Running) -> None:
@@ -294,3 +296,100 @@ def test_input_is_taken_while_a_process_is_replaced(running: Running) -> None:
     assert len(running.recorder.trackings) < 60
     watched(running)
     assert running.finish() == Finished(1, ("60 of 60 scans",))
+
+
+def test_a_process_that_is_killed_while_it_starts_has_tried_nothing(config: Config) -> None:
+    recorder = Recorder()
+    pipeline = Pipeline(config, encode=encode, save=count_scans)
+    pipeline.start(recorder)
+    running = Running(pipeline, recorder)
+    running.feed(readings(60)[:80])
+    wait_until_idle(running)
+    running.feed(readings(60)[80:])
+    # One at work, and the next one while it starts: with all that it is to go on with on its way.
+    for failures in (1, 2):
+        kill(running, ProcessName.TOPOLOGY)
+        watched(running, failures=failures)
+    assert running.finish().files == ("60 of 60 scans",)
+    assert [is_over for _, is_over in recorder.failures] == [False, False]
+    pipeline.stop(0.0)
+
+
+@pytest.mark.parametrize("is_known", [True, False])
+def test_a_topology_that_dies_before_the_session_begins_loses_nothing(
+    config: Config, tmp_path: Path, is_known: bool
+) -> None:
+    known = map_file_in(tmp_path) if is_known else tmp_path / "new.hmt"
+    before = len(read_map(known).scans) if is_known else 0
+    recorder = Recorder()
+    pipeline = Pipeline(config, encode=encode, keeper=KeptMap(known))
+    pipeline.start(recorder)
+    running = Running(pipeline, recorder)
+    running.feed(readings(30, start_s=5e4))
+    kill(running, ProcessName.TOPOLOGY)
+    watched(running)
+    assert running.finish().failure is None
+    assert recorder.failures[0][1] is False
+    assert pipeline.stop(5.0) == ()
+    assert len(read_map(known).scans) == before + 30
+
+
+def test_both_processes_may_die_at_once(running: Running) -> None:
+    running.feed(readings(60)[:60])
+    for name in BOTH:
+        kill(running, name)
+    watched(running, failures=2)
+    running.feed(readings(60)[60:])
+    assert running.finish().files == ("60 of 60 scans",)
+
+
+def test_a_client_that_takes_no_answer_does_not_keep_others_waiting(running: Running) -> None:
+    running.feed(readings(20))
+    running.finish()
+    is_over = threading.Event()
+
+    def stuck(result: Result) -> None:
+        if isinstance(result, Part):
+            is_over.wait(DEADLINE_S)
+        else:
+            is_over.set()
+
+    running.pipeline.request(MapRequest(MapMethod.CONSISTENT), stuck, timeout_s=60.0)
+    time.sleep(0.3)
+    kill(running, ProcessName.TOPOLOGY)
+    started_s = time.monotonic()
+    watched(running)
+    assert time.monotonic() - started_s < 10.0
+    assert is_over.is_set()
+
+
+def test_an_answer_that_cannot_be_passed_on_costs_nobody_else_his(running: Running) -> None:
+    running.feed(readings(20))
+    running.finish()
+
+    def broken(_: Result) -> None:
+        raise ZeroDivisionError("a bug")
+
+    running.pipeline.request(SaveRequest(), broken, timeout_s=DEADLINE_S)
+    assert Answers(running.pipeline, SaveRequest()).wait() == ("20 of 20 scans",)
+    assert running.pipeline.watch(0.0) is None
+
+
+def test_a_robot_that_is_to_be_sought_is_sought_by_the_next_process(running: Running) -> None:
+    running.feed(readings(60)[:60])
+    wait_until_idle(running)
+    assert Answers(running.pipeline, RelocalizeRequest()).wait() == ()
+    wait_until(lambda: running.recorder.mapped[-1].wakes_up)
+    kill(running, ProcessName.TOPOLOGY)
+    watched(running)
+    running.feed(readings(60)[60:])
+    running.finish()
+    told = [event.message for mapped in running.recorder.mapped for event in mapped.events]
+    assert sum("the robot may be anywhere" in message for message in told) == 1
+
+
+def wait_until(is_true: Callable[[], bool]) -> None:
+    deadline_s = time.monotonic() + DEADLINE_S
+    while not is_true():
+        assert time.monotonic() < deadline_s
+        time.sleep(0.01)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import shutil
+import sqlite3
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -143,3 +145,54 @@ def test_a_frozen_map_stays(tmp_path: Path) -> None:
     ):
         client.reset()
     assert known.exists()
+
+
+def test_what_had_arrived_before_a_map_was_left_is_in_it(tmp_path: Path) -> None:
+    shutil.copy(map_file_in(tmp_path), tmp_path / "other.hmt")
+    before = len(read_map(tmp_path / "other.hmt").scans)
+    known = tmp_path / "known.hmt"
+    with running_daemon(tmp_path / "out", map_file=known) as daemon, daemon.client() as client:
+        for reading in readings(600):
+            client.publish(reading)
+        assert client.load("other.hmt").processed_scans == 600
+        # At rest, in one file.
+        assert {file.name for file in tmp_path.glob("known*")} == {"known.hmt"}
+        assert len(read_map(known).scans) == 600
+        publish(client, later_s=1e5)
+        client.finish()
+    assert len(read_map(tmp_path / "other.hmt").scans) == before + SCANS
+
+
+def test_a_damaged_or_empty_map_is_not_gone_on_with(changing: tuple[HmtClient, Path]) -> None:
+    client, folder = changing
+    with closing(sqlite3.connect(map_file_in(folder).rename(folder / "flipped.hmt"))) as database:
+        database.execute("UPDATE scans SET stamp_s = stamp_s + 1 WHERE rowid = 7")
+        database.commit()
+    write_map(folder / "empty.hmt", replace(mapped().stored(), visits=(), hypotheses=()))
+    for name, words in (("flipped.hmt", "flipped"), ("empty.hmt", "empty")):
+        with pytest.raises(InvalidInput, match=words):
+            client.load(name)
+    assert client.status().keyframes > 0
+
+
+def test_a_reset_takes_a_link_and_a_relative_path(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "disk").mkdir()
+    real = map_file_in(tmp_path / "disk")
+    (tmp_path / "site.hmt").symlink_to(real)
+    monkeypatch.chdir(tmp_path)
+    with (
+        running_daemon(tmp_path / "out", map_file=Path("site.hmt")) as daemon,
+        daemon.client() as client,
+    ):
+        held = client.status().keyframes
+        assert client.reset().files == (str(real.with_name("map-1.hmt")),)
+        wait_until(lambda: client.status().keyframes == 0)
+        with pytest.raises(Unavailable):
+            client.posterior()
+        publish(client, later_s=1e4)
+        client.finish()
+    assert (tmp_path / "site.hmt").is_symlink()
+    assert len(read_map(real.with_name("map-1.hmt")).keyframes) == held
+    assert len(read_map(real).scans) == SCANS
