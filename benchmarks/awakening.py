@@ -1,12 +1,12 @@
-"""Waking up in a known map: a recorded log's first half is mapped, the second begins anywhere.
+"""Waking up in a known map: the first half of a drive is mapped, the second begins anywhere.
 
 Once it is a new session; once the robot is carried there while it runs, and its wheels say that it
 stands still meanwhile. Where one scan fits the other, being carried is not noticed.
 
-Where the robot really is comes from the same log mapped in one go, whose error over relations is
-centimetres. A hypothesis is right if the robot is where it says, relative to the keyframe of the
-map that it puts nearest to it, to within `scoring`'s tolerance; a session that is not tied to the
-map is neither right nor wrong.
+Where the robot really is the simulator knows, or, for a recorded log, the same log mapped in one
+go, whose error over relations is centimetres. A hypothesis is right if the robot is where it says,
+relative to the keyframe of the map that it puts nearest to it, to within `scoring`'s tolerance; a
+session that is not tied to the map is neither right nor wrong.
 
 References:
     Blanco et al. 2008, section II (the awakening problem).
@@ -19,43 +19,61 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from multiprocessing import get_context
+from pathlib import Path
 
 import networkx as nx
 import numpy as np
 
+from benchmarks.belief_figures import draw_reliability
+from benchmarks.calibration import Scores, probability_right, score
 from benchmarks.cells import Result
 from benchmarks.metric import Direction, Metric
 from benchmarks.recordings import Missing, read_recorded, recorded_file
 from benchmarks.report import Report, Run
-from benchmarks.scoring import TOLERANCE_M, TOLERANCE_RAD
+from benchmarks.scoring import TOLERANCE_M, TOLERANCE_RAD, Decision, Option
+from benchmarks.simulated import readings_of
 from hmt_service.core.awakening import is_anywhere
 from hmt_service.core.config import Config, load_config
 from hmt_service.core.engine import Engine
 from hmt_service.core.geometry import FloatArray, Pose, identity, inverse, log
 from hmt_service.core.odometry import Odometry
 from hmt_service.core.stored import StoredHypothesis, StoredMap
-from hmt_service.core.types import EventKind, OdometryReading, Reading
+from hmt_service.core.types import EventKind, OdometryReading, Reading, StampedPose
 from hmt_service.runtime.offline import map_readings
+from hmt_service.sim.simulation import SHORT_SIGHTED, simulate
+from hmt_service.sim.worlds.families import Family, draw
 
 _LOGS = ("intel", "fr079", "aces")
 _STARTS, _QUICK_STARTS = 25, 2
+# Buildings of rooms that are equal to the bit.
+_ALIASED, _QUICK_ALIASED, _ALIASED_STARTS = range(400, 410), (), 5
 _CERTAIN = 0.95
 # The map knows a place if it has a keyframe so near.
 _KNOWN_M = 1.0
 # A robot that is carried is so far from where it was, and blind for so long.
 _CARRIED_M, _LIFTED_S = 2.0, 0.2
 _WITHIN_M, _LONGEST_M = 10.0, 25.0
+FIGURE = "awakening.png"
+"""Name of the figure."""
 _LOWER, _HIGHER = Direction.LOWER_IS_BETTER, Direction.HIGHER_IS_BETTER
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Truth:
-    """Where the robot was, from the whole log."""
+    """Where the robot was, over the whole drive."""
 
     stamps_s: FloatArray
     """Of the scans, shape (S,)."""
     poses: FloatArray
     """Their poses in one frame, shape (S, 4, 4)."""
+
+    @classmethod
+    def of(cls, trajectory: Sequence[StampedPose]) -> Truth:
+        """Return what a trajectory says."""
+        return cls(
+            np.array([pose.stamp_s for pose in trajectory]),
+            np.array([pose.reference_from_body for pose in trajectory]),
+        )
 
     def at(self, stamp_s: float) -> Pose:
         """Return the pose of the scan nearest in time, shape (4, 4)."""
@@ -73,37 +91,49 @@ class Awakening:
     """Largest probability of wrong places on the way there, since it was noticed."""
     is_noticed: bool
     """Whether the odometry found out that it was lost; a new session always is."""
+    decisions: tuple[Decision, ...]
+    """What was believed at each keyframe on the way, since it was noticed."""
 
 
 def measure(run: Run) -> Report:
-    """Wake up at many places of each log that is there."""
-    metrics: list[Metric] = []
-    skipped = []
-    everything: dict[str, list[Awakening]] = {}
+    """Wake up at many places of each log that is there, and of buildings of equal rooms."""
+    config, drives, skipped = load_config(), {}, []
     for name in _LOGS[1:2] if run.is_quick else _LOGS:
         path = recorded_file(f"{name}.clf.bz2")
         if isinstance(path, Missing):
             skipped.append(f"{name}: {path.reason}")
             continue
         starts = _QUICK_STARTS if run.is_quick else _STARTS
-        result = run.once(name, partial(_woken, tuple(read_recorded(path, load_config())), starts))
-        for how, found in result.items():
-            awakenings = [Awakening(**each) for each in found]
-            metrics += _metrics(f"{how}/{name}", awakenings)
-            everything.setdefault(how, []).extend(awakenings)
-    for how, awakenings in everything.items():
-        metrics += _metrics(f"{how}/all", awakenings)
+        drives[name] = partial(_woken_in_log, path, starts, config)
+    for seed in _QUICK_ALIASED if run.is_quick else _ALIASED:
+        drives[f"aliased/{seed}"] = partial(_woken_in_aliased, seed, config)
+    found: dict[str, list[Awakening]] = {}
+    for name, drive in drives.items():
+        for how, results in run.once(name, drive).items():
+            awakenings = [_from_result(each) for each in results]
+            found.setdefault(f"{how}/{name.partition('/')[0]}", []).extend(awakenings)
+            if name in _LOGS:
+                found.setdefault(f"{how}/all", []).extend(awakenings)
+    metrics = [metric for name, each in found.items() for metric in _metrics(name, each)]
+    if scores := {name: scored for name, each in found.items() if (scored := _scores(each))}:
+        draw_reliability(scores, run.out / FIGURE)
     return Report(tuple(metrics), tuple(skipped))
 
 
-def _woken(readings: Sequence[Reading], starts: int) -> Result:
-    config = load_config()
+def _woken_in_log(path: Path, starts: int, config: Config) -> Result:
+    readings = tuple(read_recorded(path, config))
     engine, _ = map_readings(readings, config)
-    trajectory = engine.trajectory()
-    truth = Truth(
-        np.array([pose.stamp_s for pose in trajectory]),
-        np.array([pose.reference_from_body for pose in trajectory]),
-    )
+    return _woken(readings, Truth.of(engine.trajectory()), starts, config)
+
+
+def _woken_in_aliased(seed: int, config: Config) -> Result:
+    truth: list[StampedPose] = []
+    world = draw(Family.ALIASED, seed, severity=1.0)
+    readings = tuple(readings_of(simulate(world, SHORT_SIGHTED, seed), truth))
+    return _woken(readings, Truth.of(truth), _ALIASED_STARTS, config)
+
+
+def _woken(readings: Sequence[Reading], truth: Truth, starts: int, config: Config) -> Result:
     middle_s = float(np.median(truth.stamps_s))
     first = [reading for reading in readings if reading.stamp_s <= middle_s]
     second = readings[len(first) :]
@@ -129,6 +159,14 @@ def _woken(readings: Sequence[Reading], starts: int) -> Result:
         "woken": [asdict(awakening) for awakening in woken],
         "carried": [asdict(awakening) for awakening in carried],
     }
+
+
+def _from_result(result: Result) -> Awakening:
+    decisions = tuple(
+        Decision(tuple(Option(**option) for option in each["options"]), each["is_return"])
+        for each in result["decisions"]
+    )
+    return Awakening(**{**result, "decisions": decisions})
 
 
 def _in_a_copy(find: Callable[[], Awakening]) -> Awakening:
@@ -218,6 +256,7 @@ def _find(
     """
     places = np.array([truth.at(keyframe.stamp_s) for keyframe in known.keyframes])
     travelled_m = worst = 0.0
+    decisions: list[Decision] = []
     before: Pose | None = None
     is_lost = False
     for reading, here in steps:
@@ -232,42 +271,57 @@ def _find(
         # Until it is noticed, a robot that is carried is where it was.
         if tracking.keyframe is None or not is_lost:
             continue
-        right, wrong = _masses(engine.stored(), places, here)
-        worst = max(worst, wrong)
-        if right > _CERTAIN:
-            return Awakening(travelled_m, worst, is_lost)
+        decision = _decision(engine.stored(), places, here)
+        decisions.append(decision)
+        worst = max(worst, sum(o.probability for o in decision.options if _is_wrong_place(o)))
+        if probability_right(decision) > _CERTAIN:
+            return Awakening(travelled_m, worst, is_lost, tuple(decisions))
         if travelled_m > _LONGEST_M:
             break
-    return Awakening(None, worst, is_lost)
+    return Awakening(None, worst, is_lost, tuple(decisions))
 
 
-def _masses(stored: StoredMap, places: FloatArray, here: Pose) -> tuple[float, float]:
-    """Return the probabilities of the right place and of wrong ones.
+def _is_wrong_place(option: Option) -> bool:
+    return option.is_known and not option.is_right
+
+
+def _decision(stored: StoredMap, places: FloatArray, here: Pose) -> Decision:
+    """Return the places that the robot may be at, one option each, and what is not tied to the map.
 
     Args:
         stored: The map that goes on, the robot at its last keyframe.
         places: True poses of the keyframes of the map that was known, shape (K, 4, 4).
         here: The true pose of the robot, in the same frame.
     """
-    right = wrong = 0.0
     relative = _within_visits(stored)
-    for hypothesis in stored.hypotheses:
-        if not _is_tied(hypothesis):
-            continue
-        poses = np.array(
-            [hypothesis.reference_from_visit[visit] @ pose for visit, pose in relative]
-        )
-        robot = poses[-1]
-        gaps_m = np.linalg.norm(poses[: len(places), :2, 3] - robot[:2, 3], axis=1)
+    options: list[Option] = []
+    likely = sorted(stored.hypotheses, key=lambda h: -h.log_weight)
+    tied = {
+        h.hypothesis: np.array([h.reference_from_visit[visit] @ pose for visit, pose in relative])
+        for h in likely
+        if _is_tied(h)
+    }
+    masses = {h.hypothesis: math.exp(h.log_weight) for h in likely}
+    left = list(tied)
+    while left:
+        # Who puts the robot at the same place as the most probable one, says the same.
+        poses = tied[left[0]]
+        gaps_m = np.linalg.norm(poses[: len(places), :2, 3] - poses[-1][:2, 3], axis=1)
         nearest = int(np.argmin(gaps_m))
-        believed = inverse(poses[nearest]) @ robot
-        gap = inverse(inverse(places[nearest]) @ here) @ believed
-        is_near = np.linalg.norm(gap[:3, 3]) <= TOLERANCE_M
-        if is_near and np.linalg.norm(log(gap)[:3]) <= TOLERANCE_RAD:
-            right += math.exp(hypothesis.log_weight)
-        else:
-            wrong += math.exp(hypothesis.log_weight)
-    return right, wrong
+        robot = inverse(poses[nearest]) @ poses[-1]
+        same = [h for h in left if _is_near(robot, inverse(tied[h][nearest]) @ tied[h][-1])]
+        is_right = _is_near(robot, inverse(places[nearest]) @ here)
+        options.append(Option(sum(masses[h] for h in same), is_known=True, is_right=is_right))
+        left = [h for h in left if h not in same]
+    nowhere = sum(mass for hypothesis, mass in masses.items() if hypothesis not in tied)
+    options.append(Option(nowhere, is_known=False, is_right=False))
+    return Decision(tuple(sorted(options, key=lambda o: -o.probability)), is_return=True)
+
+
+def _is_near(pose: Pose, other: Pose) -> bool:
+    gap = inverse(pose) @ other
+    is_here = float(np.linalg.norm(gap[:3, 3])) <= TOLERANCE_M
+    return is_here and float(np.linalg.norm(log(gap)[:3])) <= TOLERANCE_RAD
 
 
 def _within_visits(stored: StoredMap) -> list[tuple[int, Pose]]:
@@ -303,4 +357,17 @@ def _metrics(name: str, awakenings: Sequence[Awakening]) -> list[Metric]:
     ]
     if math.isfinite(median := float(np.median(found_m))):
         numbers.append(Metric(f"{name}/found_after", median, "m", _LOWER, None))
+    if (scores := _scores(awakenings)) is not None:
+        error = scores.expected_calibration_error
+        numbers += [
+            Metric(f"{name}/decisions", float(scores.decisions), "1", _HIGHER, None),
+            Metric(f"{name}/brier", scores.brier, "1", _LOWER, None),
+            Metric(f"{name}/log_loss", scores.log_loss, "nat", _LOWER, None),
+            Metric(f"{name}/calibration_error", error, "1", _LOWER, None),
+        ]
     return numbers
+
+
+def _scores(awakenings: Sequence[Awakening]) -> Scores | None:
+    decisions = [decision for awakening in awakenings for decision in awakening.decisions]
+    return score(decisions) if decisions else None
