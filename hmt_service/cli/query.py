@@ -118,7 +118,7 @@ def posterior(
         Path | None,
         typer.Option(
             help="Figure to draw, such as posterior.png: effective sample size and probabilities "
-            "of the areas over time."
+            "of topologies and areas over time."
         ),
     ] = None,
     start: Annotated[float | None, typer.Option(help="Sensor time at its left, s.")] = None,
@@ -127,9 +127,10 @@ def posterior(
 ) -> None:
     """Show the topologies that the robot may have travelled, with their probabilities.
 
-    Of a saved run (DIR), and with --out: where it was believed to be, over time.
+    Of a saved run (DIR), and with --out, --start or --end: how they and the probabilities of the
+    areas that it may have been in changed over time.
     """
-    if run is not None or out is not None:
+    if any(each is not None for each in (run, out, start, end)):
         beliefs = _history(run, connect, site, robot, zenoh_config, timeout)
         _show_history(beliefs, out, start, end, as_json)
         return
@@ -171,7 +172,7 @@ def events(
 ) -> None:
     """Show what was decided, with the numbers that caused it: the oldest first.
 
-    Of a daemon the latest ones; of a saved run (DIR) all.
+    The latest ones: of a daemon 1,000, of a saved run (DIR) 10,000.
     """
     if run is not None:
         from hmt_service.io.audit_files import read_events
@@ -311,6 +312,11 @@ def _history(
     return read_beliefs(run / BELIEFS)
 
 
+def _likely(probabilities: Mapping[int, float]) -> str:
+    likely = sorted(probabilities.items(), key=lambda item: -item[1])
+    return "  ".join(f"{number}: {p:.3f}" for number, p in likely)
+
+
 def _show_history(
     beliefs: tuple[Belief, ...],
     out: Path | None,
@@ -336,14 +342,17 @@ def _history_table(beliefs: tuple[Belief, ...]) -> Table:
         (
             f"{belief.stamp_s:.2f}",
             f"{belief.effective_sample_size:.2f}",
-            "  ".join(
-                f"{area}: {p:.3f}"
-                for area, p in sorted(belief.current_area.items(), key=lambda item: -item[1])
-            ),
+            _likely(belief.current_area),
+            _likely(belief.hypotheses),
         )
         for belief in beliefs
     )
-    headings = ("stamp s", "effective sample size", "area: probability")
+    headings = (
+        "stamp s",
+        "effective sample size",
+        "area: probability",
+        "hypothesis: probability",
+    )
     return table_of("where the robot was believed to be, where that changed", headings, rows)
 
 

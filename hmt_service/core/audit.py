@@ -7,7 +7,7 @@ References:
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -15,6 +15,7 @@ import numpy as np
 
 from hmt_service.core.types import (
     Belief,
+    DropReason,
     Event,
     EventKind,
     Keyframe,
@@ -25,10 +26,17 @@ from hmt_service.core.types import (
 )
 
 if TYPE_CHECKING:
-    from hmt_service.core.hypotheses import Hypothesis, ParticleLayer
+    from hmt_service.core.hypotheses import Dropped, Hypothesis, ParticleLayer
     from hmt_service.core.transition import Successor
     from hmt_service.core.visits import MemoryUsage
 
+# What is said of a hypothesis that is dropped, and the name of the number that caused it.
+_WHY = {
+    DropReason.NEGLIGIBLE: ("less than {:.0e}", "negligible_mass"),
+    DropReason.RESAMPLED: ("the budget is {:g}", "budget"),
+    DropReason.UNLIKELY: ("unlikely for more than {:g} areas", "patience_areas"),
+    DropReason.SAME_MAP: ("the same map as {:g}", "same_as"),
+}
 # Beliefs that differ by no more than this are one that lasts.
 _EQUAL = 1e-6
 
@@ -70,7 +78,12 @@ class Audit:
 
 def belief_of(posterior: Posterior) -> Belief:
     """Return what a posterior says of where the robot is."""
-    return Belief(posterior.stamp_s, posterior.current_area, posterior.effective_sample_size)
+    return Belief(
+        posterior.stamp_s,
+        posterior.current_area,
+        posterior.effective_sample_size,
+        {summary.hypothesis: summary.probability for summary in posterior.hypotheses},
+    )
 
 
 def between(beliefs: Sequence[Belief], start_s: float, end_s: float) -> tuple[Belief, ...]:
@@ -87,11 +100,18 @@ def between(beliefs: Sequence[Belief], start_s: float, end_s: float) -> tuple[Be
 
 
 def _is_same(first: Belief, second: Belief) -> bool:
-    if first.current_area.keys() != second.current_area.keys():
-        return False
-    gaps = [abs(p - second.current_area[area]) for area, p in first.current_area.items()]
     gap = first.effective_sample_size - second.effective_sample_size
-    return max(gaps, default=0.0) <= _EQUAL and abs(gap) <= _EQUAL
+    return (
+        abs(gap) <= _EQUAL
+        and _are_equal(first.current_area, second.current_area)
+        and _are_equal(first.hypotheses, second.hypotheses)
+    )
+
+
+def _are_equal(first: Mapping[int, float], second: Mapping[int, float]) -> bool:
+    return first.keys() == second.keys() and all(
+        abs(p - second[each]) <= _EQUAL for each, p in first.items()
+    )
 
 
 # ---------------------------------------------------------------------- what events say
@@ -142,29 +162,36 @@ def branched(parent: Hypothesis, child: Hypothesis, successor: Successor, stamp_
     return Event(EventKind.BRANCHED, stamp_s, message, numbers)
 
 
-def pruned(
-    dropped: Iterable[Hypothesis], stamp_s: float, verb: str = "dropped"
-) -> tuple[Event, ...]:
+def pruned(dropped: Sequence[Dropped], stamp_s: float) -> tuple[Event, ...]:
     """Return that hypotheses are no longer followed."""
-    return tuple(
-        Event(
-            EventKind.PRUNED,
-            stamp_s,
-            f"{verb} hypothesis {h.hypothesis} in area {h.current.area}, "
-            f"probability {np.exp(h.log_weight):.2g}",
-            {
-                "hypothesis": float(h.hypothesis),
-                "area": float(h.current.area),
-                "log_weight": h.log_weight,
-            },
-        )
-        for h in dropped
+    return tuple(_pruned(each, stamp_s) for each in dropped)
+
+
+def _pruned(dropped: Dropped, stamp_s: float) -> Event:
+    why, limit = _WHY[dropped.reason]
+    message = (
+        f"dropped hypothesis {dropped.hypothesis} in area {dropped.area}, "
+        f"probability {np.exp(dropped.log_weight):.2g}: {why.format(dropped.limit)}"
     )
+    numbers = {
+        "hypothesis": float(dropped.hypothesis),
+        "area": float(dropped.area),
+        "log_weight": dropped.log_weight,
+        limit: float(dropped.limit),
+    }
+    return Event(EventKind.PRUNED, stamp_s, message, numbers)
 
 
-def accepted(best: Hypothesis, stamp_s: float) -> Event:
-    """Return that only one hypothesis is left."""
-    numbers = {"hypothesis": float(best.hypothesis), "areas": float(len(best.topology.areas))}
+def accepted(particles: ParticleLayer, dropped: Sequence[Dropped], stamp_s: float) -> Event:
+    """Return that only one hypothesis is left, and what the last others weighed."""
+    best = particles.best
+    numbers = {
+        "hypothesis": float(best.hypothesis),
+        "areas": float(len(best.topology.areas)),
+        "loop_closures": float(len(best.topology.assignments) - len(best.topology.areas)),
+        "last_dropped": float(len(dropped)),
+        "last_dropped_mass": float(sum(np.exp(each.log_weight) for each in dropped)),
+    }
     message = f"accepted hypothesis {best.hypothesis}: no other is left"
     return Event(EventKind.ACCEPTED, stamp_s, message, numbers)
 

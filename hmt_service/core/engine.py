@@ -262,8 +262,8 @@ class Engine:
             self._visits.put(extended)
             return (lost, *self._divide(extended))
         self._visits.put(extended)  # metric SLAM
-        events = self._weigh(keyframe)  # Eq. (12)
-        return (*events, *self._look_again(extended), *self._divide(extended))
+        self._weigh(keyframe)  # Eq. (12)
+        return (*self._look_again(extended), *self._divide(extended))
 
     def _look_again(self, visit: Visit) -> tuple[Event, ...]:
         """Place a visit that began nowhere with all that it has seen, each time that has doubled.
@@ -359,34 +359,27 @@ class Engine:
         self._motions.append(arc)
         expanded, branched = self._expand(opened, arc, stamp_s)
         self._visits.put(opened)
-        pruned = audit.pruned(self._particles.replace(expanded), stamp_s)
-        return (*settled, audit.entered(self._particles, stamp_s), *branched, *pruned)
+        self._particles.replace(expanded)
+        return (*settled, audit.entered(self._particles, stamp_s), *branched)
 
     def _settle(self, visit: Visit, stamp_s: float) -> tuple[Event, ...]:
         """Use all that a visit that is over has seen, and keep of the one before what is new."""
         if visit.visit < self._frozen_visits:
             return ()
         refined = self._refined(visit, stamp_s)
-        forgotten = self._forget(stamp_s)
+        particles = self._config.particles
+        self._particles.forget(
+            unlikely_mass=particles.unlikely_mass, patience=particles.patience_areas
+        )
         recognised = self._recognise(visit, stamp_s)
         self._forget_visits(visit.visit - 1)
-        return (*refined, *forgotten, *recognised)
+        return (*refined, *recognised)
 
     def _refined(self, visit: Visit, stamp_s: float) -> tuple[Event, ...]:
         """Refine all hypotheses, and keep one of those that are the same map since."""
         refined = self._refine(visit, stamp_s)
-        return (*refined, *audit.pruned(self._particles.merge(), stamp_s, "merged"))
-
-    def _forget(self, stamp_s: float) -> tuple[Event, ...]:
-        """Drop what nothing has spoken for since long, and accept what alone is left."""
-        particles = self._config.particles
-        dropped = self._particles.forget(
-            unlikely_mass=particles.unlikely_mass, patience=particles.patience_areas
-        )
-        if not dropped or len(self._particles.hypotheses) > 1:
-            return audit.pruned(dropped, stamp_s)
-        accepted = audit.accepted(self._particles.best, stamp_s)
-        return (*audit.pruned(dropped, stamp_s), accepted)
+        self._particles.merge()
+        return refined
 
     def _recognise(self, visit: Visit, stamp_s: float) -> tuple[Event, ...]:
         """Branch over where else in the map what a finished visit has seen may be."""
@@ -405,8 +398,8 @@ class Engine:
                 branched.append(audit.branched(hypothesis, child, match, stamp_s))
         if not recognising:
             return ()
-        pruned = self._particles.replace([*_resembling(known, log_resemblance), *recognising])
-        return (*branched, *audit.pruned(pruned, stamp_s))
+        self._particles.replace([*_resembling(known, log_resemblance), *recognising])
+        return tuple(branched)
 
     def _expand(
         self, visit: Visit, arc: Factor, stamp_s: float
@@ -430,13 +423,12 @@ class Engine:
             if child.hypothesis != parent.hypothesis
         ]
 
-    def _weigh(self, keyframe: Keyframe) -> tuple[Event, ...]:
+    def _weigh(self, keyframe: Keyframe) -> None:
         """Multiply the weights by the predictive likelihood of a keyframe, Eq. (12)."""
         if len(self._particles.hypotheses) == 1:
-            return ()
+            return
         evidence = self._weighed[keyframe.index] = self._said(len(self._open.keyframes) - 1)
-        dropped = self._particles.reweight(lambda h: evidence[h.hypothesis])
-        return audit.pruned(dropped, keyframe.stamp_s)
+        self._particles.reweight(lambda h: evidence[h.hypothesis])
 
     def _recall(self) -> None:
         """Find out what the keyframes of the open visit said, which no file tells."""
@@ -519,8 +511,13 @@ class Engine:
 
     def _audited(self, events: tuple[Event, ...]) -> tuple[Event, ...]:
         """Keep what was decided, and what is believed since."""
+        particles, stamp_s = self._particles, self._open.last_stamp_s
+        if dropped := particles.take_dropped():
+            events = (*events, *audit.pruned(dropped, stamp_s))
+            if len(particles.hypotheses) == 1:
+                events = (*events, audit.accepted(particles, dropped, stamp_s))
         self._audit.note(events)
-        self._audit.believe(self._particles.belief(self._open.last_stamp_s))
+        self._audit.believe(particles.belief(stamp_s))
         return events
 
     # ------------------------------------------------------------------ what somebody else knows
@@ -597,8 +594,8 @@ class Engine:
         before, stamp_s = self._particles.hypotheses, self._open.last_stamp_s
         for _, child in expanded:
             child.graph.poses()  # who cannot be solved must not be believed
-        dropped = self._particles.replace([child for _, child in expanded])
-        merged = self._particles.merge()
+        self._particles.replace([child for _, child in expanded])
+        self._particles.merge()
         self._revision += 1
         likely = zip(self._particles.hypotheses, self._particles.probabilities, strict=True)
         after = {h.hypothesis: float(probability) for h, probability in likely}
@@ -609,8 +606,7 @@ class Engine:
             self._revision,
             effects(before, expanded, statement, after),
         )
-        pruned = audit.pruned(dropped, stamp_s), audit.pruned(merged, stamp_s, "merged")
-        self._untold += self._audited((told(effect, stamp_s), *pruned[0], *pruned[1]))
+        self._untold += self._audited((told(effect, stamp_s),))
         return effect
 
     def untold(self) -> tuple[Event, ...]:

@@ -32,7 +32,7 @@ from hmt_service.core.geometry import (
 )
 from hmt_service.core.graph import Factor, PoseGraph
 from hmt_service.core.submap import Visit
-from hmt_service.core.types import Belief, HypothesisSummary, Localization
+from hmt_service.core.types import Belief, DropReason, HypothesisSummary, Localization
 
 SAME_AREA = 2.0 / 3.0
 """A visit was to an area, and did not only see into it, if the area explains so much of it."""
@@ -325,6 +325,23 @@ class Hypothesis:
         return apart_m <= SEPARATION_M and apart_rad <= SEPARATION_RAD
 
 
+@dataclass(frozen=True, slots=True)
+class Dropped:
+    """A hypothesis that is no longer followed."""
+
+    hypothesis: int
+    """Its identifier."""
+    area: int
+    """Where the robot was, said it."""
+    log_weight: float
+    """Log of its last posterior mass."""
+    reason: DropReason
+    """Why."""
+    limit: float
+    """The number that it did not meet: a mass, the budget, a number of areas; of the same map the
+    identifier of the other one."""
+
+
 class ParticleLayer:
     """The set of hypotheses and their weights."""
 
@@ -340,6 +357,7 @@ class ParticleLayer:
         self._negligible_mass = negligible_mass
         self._rng = rng
         self._hypotheses: tuple[Hypothesis, ...] = ()
+        self._dropped: list[Dropped] = []
 
     @property
     def hypotheses(self) -> tuple[Hypothesis, ...]:
@@ -392,75 +410,86 @@ class ParticleLayer:
         Args:
             stamp_s: Sensor time of the last observation.
         """
-        return Belief(stamp_s, self.current_area(), self.effective_sample_size)
+        likely = zip(self._hypotheses, self.probabilities, strict=True)
+        masses = {h.hypothesis: float(probability) for h, probability in likely}
+        return Belief(stamp_s, self.current_area(), self.effective_sample_size, masses)
 
-    def replace(self, hypotheses: Sequence[Hypothesis]) -> tuple[Hypothesis, ...]:
+    def take_dropped(self) -> tuple[Dropped, ...]:
+        """Return, once, the hypotheses that are no longer followed, in the order of their end."""
+        dropped, self._dropped = tuple(self._dropped), []
+        return dropped
+
+    def replace(self, hypotheses: Sequence[Hypothesis]) -> None:
         """Take a new set, normalise it, drop what is negligible and resample down to the budget.
 
         Args:
             hypotheses: At least one, with log weights of any common scale.
-
-        Returns:
-            The hypotheses that were dropped, with their last normalised weights.
         """
         given = _normalised(hypotheses)
         kept = [h for h in given if np.exp(h.log_weight) >= self._negligible_mass]
+        self._drop(given, kept, DropReason.NEGLIGIBLE, self._negligible_mass)
         if len(kept) > self._budget:
+            several = kept
             weights = np.exp([h.log_weight for h in kept])
             weights /= weights.sum()
             # Who may keep only one wants the best, not a fair draw.
             best = [(int(np.argmax(weights)), 1.0)]
-            several = self._budget > 1
-            survivors = optimal_resampling(weights, self._budget, self._rng) if several else best
+            is_drawn = self._budget > 1
+            survivors = optimal_resampling(weights, self._budget, self._rng) if is_drawn else best
             kept = [replace(kept[i], log_weight=float(np.log(weight))) for i, weight in survivors]
-        identifiers = {h.hypothesis for h in kept}
+            self._drop(several, kept, DropReason.RESAMPLED, self._budget)
         self._hypotheses = tuple(
             sorted(_normalised(kept), key=lambda h: (-h.log_weight, h.hypothesis))
         )
-        return tuple(h for h in given if h.hypothesis not in identifiers)
 
-    def reweight(self, log_likelihood: Callable[[Hypothesis], float]) -> tuple[Hypothesis, ...]:
+    def _drop(
+        self,
+        before: Iterable[Hypothesis],
+        kept: Iterable[Hypothesis],
+        reason: DropReason,
+        limit: float,
+    ) -> None:
+        left = {h.hypothesis for h in kept}
+        self._dropped += [
+            Dropped(h.hypothesis, h.current.area, h.log_weight, reason, limit)
+            for h in before
+            if h.hypothesis not in left
+        ]
+
+    def reweight(self, log_likelihood: Callable[[Hypothesis], float]) -> None:
         """Multiply each weight by the predictive likelihood of an observation; see `replace`."""
-        return self.replace([h.weighed(log_likelihood(h)) for h in self._hypotheses])
+        self.replace([h.weighed(log_likelihood(h)) for h in self._hypotheses])
 
-    def merge(self) -> tuple[Hypothesis, ...]:
+    def merge(self) -> None:
         """Keep one of hypotheses that differ only in the name of a place, with the mass of all.
 
         A visit on the border of two areas may be said to be to either. Where all areas and all
         poses are the same, that is no difference in the world.
-
-        Returns:
-            The hypotheses that are no longer there.
         """
         kept: list[Hypothesis] = []
-        merged: list[Hypothesis] = []
         for hypothesis in self._hypotheses:
             index = next((i for i, h in enumerate(kept) if h.is_same_map(hypothesis)), None)
             if index is None:
                 kept.append(hypothesis)
                 continue
+            self._drop([hypothesis], [], DropReason.SAME_MAP, kept[index].hypothesis)
             kept[index] = kept[index].merged(hypothesis)
-            merged.append(hypothesis)
         self.replace(kept)
-        return tuple(merged)
 
-    def forget(self, *, unlikely_mass: float, patience: int) -> tuple[Hypothesis, ...]:
+    def forget(self, *, unlikely_mass: float, patience: int) -> None:
         """Drop what has been unlikely for long; to be called once per area entered.
 
         Args:
             unlikely_mass: Posterior mass below which a hypothesis is unlikely.
             patience: Number of areas for which it may be.
-
-        Returns:
-            The hypotheses that were dropped.
         """
         aged = [
             replace(h, unlikely_for=h.unlikely_for + 1 if probability < unlikely_mass else 0)
             for h, probability in zip(self._hypotheses, self.probabilities, strict=True)
         ]
         kept = [h for h in aged if h.unlikely_for <= patience]
+        self._drop(aged, kept, DropReason.UNLIKELY, patience)
         self.replace(kept)
-        return tuple(h for h in aged if h.unlikely_for > patience)
 
     def summaries(self) -> tuple[HypothesisSummary, ...]:
         """Return what readers may know of each hypothesis, the most probable first."""

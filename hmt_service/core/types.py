@@ -221,7 +221,7 @@ class Localization:
 
 @dataclass(frozen=True, slots=True)
 class Belief:
-    """What was believed of where the robot is, at one moment."""
+    """What was believed of where the robot is and has been, at one moment."""
 
     stamp_s: float
     """Sensor time."""
@@ -229,6 +229,8 @@ class Belief:
     """Marginal probability of the robot's current area."""
     effective_sample_size: float
     """1 / sum of squared weights, in [1, number of hypotheses]."""
+    hypotheses: Mapping[int, float] = field(default_factory=dict)
+    """Posterior mass of each topology, Eq. (14), by the identifier of its hypothesis."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -263,6 +265,19 @@ class HmtPose:
     """How sure it is that the robot is there."""
     revision: int
     """Map revision."""
+
+
+class DropReason(StrEnum):
+    """Why a hypothesis is no longer followed."""
+
+    NEGLIGIBLE = "negligible"
+    """Its posterior mass is less than what is worth anything."""
+    RESAMPLED = "resampled"
+    """There were more than the budget, and the draw left it out."""
+    UNLIKELY = "unlikely"
+    """It was unlikely for many areas in a row."""
+    SAME_MAP = "same_map"
+    """It was the same map as another one, which has its mass."""
 
 
 class MapMethod(StrEnum):

@@ -276,6 +276,7 @@ def _belief_to_proto(belief: Belief) -> pb.Belief:
         stamp_s=belief.stamp_s,
         current_area=dict(belief.current_area),
         effective_sample_size=belief.effective_sample_size,
+        hypotheses=dict(belief.hypotheses),
     )
 
 
@@ -284,6 +285,7 @@ def _belief(message: pb.Belief) -> Belief:
         stamp_s=message.stamp_s,
         current_area=dict(message.current_area),
         effective_sample_size=message.effective_sample_size,
+        hypotheses=dict(message.hypotheses),
     )
 
 

@@ -1,4 +1,4 @@
-"""Figure of a belief over time: effective sample size and the marginal of the current area.
+"""Figure of a belief over time: effective sample size, topologies, marginal of the current area.
 
 References:
     Blanco et al. 2008, Fig. 10 (the same while a loop is closed).
@@ -6,13 +6,14 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from hmt_service.core.geometry import FloatArray
 from hmt_service.core.types import Belief
 from hmt_service.errors import InvalidInput
 from hmt_service.viz.figures import check_image
@@ -22,10 +23,14 @@ _MOST_AREAS = 8
 _LEAST_DOUBT = 0.01
 _INK, _FILL = "#202020", "#0072B2"
 _PANEL_IN, _WIDTH_IN = 1.1, 10.0
+# Okabe and Ito: colour-blind readers can tell them apart.
+_COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#F0E442")
 
 
 def draw_history(beliefs: Sequence[Belief], path: Path) -> None:
-    """Draw effective sample size and probabilities of areas over time, one panel each.
+    """Draw effective sample size, probabilities of topologies, and those of areas over time.
+
+    The topologies share a panel, each hypothesis stacked on those before it in a colour of its own.
 
     Args:
         beliefs: In time order; each lasts until the next.
@@ -40,13 +45,14 @@ def draw_history(beliefs: Sequence[Belief], path: Path) -> None:
         raise InvalidInput("no belief to draw: none between the two times")
     areas = doubted_areas(beliefs)
     stamps_s = np.array([belief.stamp_s for belief in beliefs])
-    size = (_WIDTH_IN, _PANEL_IN * (len(areas) + 1) + 0.9)
+    size = (_WIDTH_IN, _PANEL_IN * (len(areas) + 2) + 0.9)
     figure = Figure(figsize=size, layout="constrained")
-    panels: list[Axes] = list(figure.subplots(len(areas) + 1, 1, sharex=True, squeeze=False)[:, 0])
+    panels: list[Axes] = list(figure.subplots(len(areas) + 2, 1, sharex=True, squeeze=False)[:, 0])
     ess = np.array([belief.effective_sample_size for belief in beliefs])
     panels[0].step(stamps_s, ess, where="post", color=_INK, linewidth=1.0)
     panels[0].set(ylim=(0.0, 1.15 * float(ess.max())), ylabel="effective\nsample size")
-    for axes, area in zip(panels[1:], areas, strict=True):
+    _stack(panels[1], stamps_s, [belief.hypotheses for belief in beliefs])
+    for axes, area in zip(panels[2:], areas, strict=True):
         mass = np.array([belief.current_area.get(area, 0.0) for belief in beliefs])
         axes.fill_between(stamps_s, mass, step="post", color=_FILL, alpha=0.35, linewidth=0.0)
         axes.step(stamps_s, mass, where="post", color=_FILL, linewidth=1.0)
@@ -57,6 +63,23 @@ def draw_history(beliefs: Sequence[Belief], path: Path) -> None:
     panels[-1].set_xlabel("sensor time / s")
     panels[0].set_title("Where the robot was believed to be", fontsize=11)
     figure.savefig(path, dpi=150)
+
+
+def _stack(axes: Axes, stamps_s: FloatArray, masses: Sequence[Mapping[int, float]]) -> None:
+    """Draw the posterior of the topologies, the oldest hypothesis at the bottom."""
+    below = np.zeros(len(stamps_s))
+    for number, hypothesis in enumerate(sorted({each for mass in masses for each in mass})):
+        above = below + np.array([mass.get(hypothesis, 0.0) for mass in masses])
+        axes.fill_between(
+            stamps_s,
+            below,
+            above,
+            step="post",
+            color=_COLOURS[number % len(_COLOURS)],
+            linewidth=0.0,
+        )
+        below = above
+    axes.set(ylim=(0.0, 1.05), ylabel="topologies")
 
 
 def doubted_areas(beliefs: Sequence[Belief]) -> list[int]:

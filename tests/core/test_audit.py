@@ -75,8 +75,27 @@ def test_every_hypothesis_has_an_origin_and_every_dropped_one_a_mass(engine: Eng
         assert np.isfinite(event.numbers["log_factor"])
     # Branches of one parent: the one that is kept explains what was seen better.
     assert any(event.numbers["overlap"] > 0.45 for event in born.values())
+    limits = {"negligible_mass", "budget", "patience_areas", "same_as"}
     for event in dropped:
         assert event.numbers["log_weight"] <= 0.0
+        assert len(limits & event.numbers.keys()) == 1
+
+
+def test_what_is_left_alone_is_accepted_whatever_became_of_the_others(engine: Engine) -> None:
+    living, alone = {0.0}, []
+    for event in engine.audit.events:
+        if event.kind is EventKind.BRANCHED:
+            living -= {event.numbers["parent"]}
+            living.add(event.numbers["hypothesis"])
+        elif event.kind is EventKind.PRUNED:
+            living.discard(event.numbers["hypothesis"])
+        elif event.kind is EventKind.ACCEPTED and "last_dropped" in event.numbers:
+            assert event.numbers["hypothesis"] in living
+            assert event.numbers["last_dropped_mass"] <= event.numbers["last_dropped"]
+            alone.append(event.stamp_s)
+    certain = [b.stamp_s for b in engine.audit.beliefs if len(b.hypotheses) == 1]
+    assert alone
+    assert set(alone) <= set(certain)
 
 
 def test_beliefs_end_with_the_posterior(engine: Engine) -> None:
@@ -86,7 +105,10 @@ def test_beliefs_end_with_the_posterior(engine: Engine) -> None:
     assert last.stamp_s == snapshot.posterior.stamp_s
     assert last.current_area == snapshot.posterior.current_area
     assert last.effective_sample_size == snapshot.posterior.effective_sample_size
-    assert all(sum(b.current_area.values()) == pytest.approx(1.0) for b in engine.audit.beliefs)
+    for belief in engine.audit.beliefs:
+        assert sum(belief.current_area.values()) == pytest.approx(1.0)
+        assert sum(belief.hypotheses.values()) == pytest.approx(1.0)
+    assert last.hypotheses == {h.hypothesis: h.probability for h in snapshot.posterior.hypotheses}
 
 
 def test_a_new_area_that_turns_out_to_be_a_known_one_is_said_to_be() -> None:

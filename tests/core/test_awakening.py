@@ -11,7 +11,7 @@ import pytest
 from hmt_service.core.awakening import is_anywhere
 from hmt_service.core.config import load_config
 from hmt_service.core.engine import Engine
-from hmt_service.core.geometry import Pose, certain, identity, inverse, log, planar_pose
+from hmt_service.core.geometry import Pose, certain, identity, inverse, log, planar_pose, yaw_of
 from hmt_service.core.graph import Factor, PoseGraph
 from hmt_service.core.odometry import Odometry
 from hmt_service.core.stored import StoredMap, StoredVisit
@@ -23,12 +23,14 @@ from tests.core.factories import (
     CORRIDOR,
     RING,
     ROOM,
+    SQUARE,
     Walls,
     box,
     drive,
     gaussian,
     line,
     motion_covariance,
+    processed,
     ring_path,
     shifted,
     trackings_of,
@@ -75,6 +77,19 @@ def ring() -> Engine:
             engine.process(tracking)
     engine.finish()
     return engine
+
+
+def test_each_way_to_be_in_one_place_is_a_hypothesis_of_its_own() -> None:
+    stay = line(identity(), length_m=2.0)
+    engine, _ = processed(trackings_of((SQUARE, stay, certain(identity()))))
+    again = Engine.restored(engine.stored())
+    asleep = trackings_of((SQUARE, [planar_pose(0.5, 0.3, 0.3)], certain(identity())))
+    processed(asleep, known=again)
+    inside = [h for h in again.stored().hypotheses if h.assignments[-1].area == 0]
+    # A square room looks the same after each quarter turn.
+    turns = sorted(yaw_of(h.reference_from_visit[1]) for h in inside)
+    assert np.diff(turns) == pytest.approx([np.pi / 2.0] * 3, abs=0.02)
+    assert min(np.exp([h.log_weight for h in inside])) > 0.02
 
 
 @pytest.mark.parametrize("name", ["ring", "flat"])

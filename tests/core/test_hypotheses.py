@@ -19,6 +19,7 @@ from hmt_service.core.hypotheses import (
     Topology,
     optimal_resampling,
 )
+from hmt_service.core.types import DropReason
 from tests.core.factories import gaussian
 
 
@@ -86,20 +87,23 @@ def test_reweighting_is_bayes_rule() -> None:
 
 def test_negligible_hypotheses_are_dropped_and_reported() -> None:
     layer = layer_of(0.6, 0.4, negligible_mass=1e-3)
-    dropped = layer.replace(
-        [hypothesis_of(0, 0.6), hypothesis_of(1, 0.4), hypothesis_of(2, 0.9e-3)]
-    )
-    assert [h.hypothesis for h in dropped] == [2]
-    assert math.exp(dropped[0].log_weight) == pytest.approx(0.9e-3 / 1.0009)
+    layer.replace([hypothesis_of(0, 0.6), hypothesis_of(1, 0.4), hypothesis_of(2, 0.9e-3)])
+    (dropped,) = layer.take_dropped()
+    assert (dropped.hypothesis, dropped.reason) == (2, DropReason.NEGLIGIBLE)
+    assert dropped.limit == 1e-3
+    assert math.exp(dropped.log_weight) == pytest.approx(0.9e-3 / 1.0009)
     assert layer.probabilities == pytest.approx([0.6, 0.4])
-    assert not layer.replace([hypothesis_of(0, 0.6), hypothesis_of(1, 1.1e-3)])
+    layer.replace([hypothesis_of(0, 0.6), hypothesis_of(1, 1.1e-3)])
+    assert layer.take_dropped() == ()
 
 
 def test_budget_is_kept_and_what_is_lost_is_reported() -> None:
     layer = layer_of(1.0, budget=3)
-    dropped = layer.replace([hypothesis_of(i, 1.0) for i in range(8)])
+    layer.replace([hypothesis_of(i, 1.0) for i in range(8)])
+    dropped = layer.take_dropped()
     assert len(layer.hypotheses) == 3
-    assert sorted([h.hypothesis for h in layer.hypotheses] + [h.hypothesis for h in dropped]) == (
+    assert {(d.reason, d.limit) for d in dropped} == {(DropReason.RESAMPLED, 3)}
+    assert sorted([h.hypothesis for h in layer.hypotheses] + [d.hypothesis for d in dropped]) == (
         list(range(8))
     )
     assert layer.probabilities == pytest.approx(np.full(3, 1 / 3))
@@ -249,7 +253,9 @@ def test_two_names_of_one_place_are_one_hypothesis() -> None:
             for hypothesis, weight in ((first, 0.5), (second, 0.3), (elsewhere, 0.2))
         ]
     )
-    assert [h.hypothesis for h in layer.merge()] == [11]
+    layer.merge()
+    (merged,) = layer.take_dropped()
+    assert (merged.hypothesis, merged.reason, merged.limit) == (11, DropReason.SAME_MAP, 10)
     assert [h.hypothesis for h in layer.hypotheses] == [10, 12]
     assert layer.probabilities == pytest.approx([0.8, 0.2])
 
@@ -260,21 +266,25 @@ def test_a_new_area_where_a_known_one_is_stays_another_hypothesis() -> None:
     new = replace(known, hypothesis=11, topology=base.topology.with_visit(Assignment(2, 2, None)))
     layer = ParticleLayer(budget=9, negligible_mass=1e-9, rng=np.random.default_rng(0))
     layer.replace([known, new])
-    assert layer.merge() == ()
+    layer.merge()
+    assert layer.take_dropped() == ()
     assert len(layer.hypotheses) == 2
 
 
 def test_what_stays_unlikely_is_forgotten_and_what_recovers_is_not() -> None:
     layer = layer_of(0.9, 0.0999, 1e-4)
     for _ in range(3):
-        assert layer.forget(unlikely_mass=1e-3, patience=3) == ()
+        layer.forget(unlikely_mass=1e-3, patience=3)
     # It becomes likely once: the count begins again.
     layer.reweight(lambda h: 6.0 if h.hypothesis == 2 else 0.0)
-    assert layer.forget(unlikely_mass=1e-3, patience=3) == ()
+    layer.forget(unlikely_mass=1e-3, patience=3)
     layer.reweight(lambda h: -6.0 if h.hypothesis == 2 else 0.0)
     for _ in range(3):
-        assert layer.forget(unlikely_mass=1e-3, patience=3) == ()
-    assert [h.hypothesis for h in layer.forget(unlikely_mass=1e-3, patience=3)] == [2]
+        layer.forget(unlikely_mass=1e-3, patience=3)
+    assert layer.take_dropped() == ()
+    layer.forget(unlikely_mass=1e-3, patience=3)
+    (dropped,) = layer.take_dropped()
+    assert (dropped.hypothesis, dropped.reason) == (2, DropReason.UNLIKELY)
     assert layer.probabilities == pytest.approx([0.9, 0.1], abs=1e-3)
 
 

@@ -392,8 +392,15 @@ class Events(_message.Message):
     def __init__(self, events: _Optional[_Iterable[_Union[Event, _Mapping]]] = ...) -> None: ...
 
 class Belief(_message.Message):
-    __slots__ = ("stamp_s", "current_area", "effective_sample_size")
+    __slots__ = ("stamp_s", "current_area", "effective_sample_size", "hypotheses")
     class CurrentAreaEntry(_message.Message):
+        __slots__ = ("key", "value")
+        KEY_FIELD_NUMBER: _ClassVar[int]
+        VALUE_FIELD_NUMBER: _ClassVar[int]
+        key: int
+        value: float
+        def __init__(self, key: _Optional[int] = ..., value: _Optional[float] = ...) -> None: ...
+    class HypothesesEntry(_message.Message):
         __slots__ = ("key", "value")
         KEY_FIELD_NUMBER: _ClassVar[int]
         VALUE_FIELD_NUMBER: _ClassVar[int]
@@ -403,10 +410,12 @@ class Belief(_message.Message):
     STAMP_S_FIELD_NUMBER: _ClassVar[int]
     CURRENT_AREA_FIELD_NUMBER: _ClassVar[int]
     EFFECTIVE_SAMPLE_SIZE_FIELD_NUMBER: _ClassVar[int]
+    HYPOTHESES_FIELD_NUMBER: _ClassVar[int]
     stamp_s: float
     current_area: _containers.ScalarMap[int, float]
     effective_sample_size: float
-    def __init__(self, stamp_s: _Optional[float] = ..., current_area: _Optional[_Mapping[int, float]] = ..., effective_sample_size: _Optional[float] = ...) -> None: ...
+    hypotheses: _containers.ScalarMap[int, float]
+    def __init__(self, stamp_s: _Optional[float] = ..., current_area: _Optional[_Mapping[int, float]] = ..., effective_sample_size: _Optional[float] = ..., hypotheses: _Optional[_Mapping[int, float]] = ...) -> None: ...
 
 class History(_message.Message):
     __slots__ = ("beliefs", "revision")
