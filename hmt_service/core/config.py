@@ -160,12 +160,16 @@ class TransitionConfig(Section):
     max_candidates: int = Field(default=8, ge=1)
     """Most known areas that one entry is compared with: the nearest."""
     outside_share: float = Field(default=0.1, gt=0.0, lt=1.0)
-    """Prior probability that a robot that wakes up is at a place that its map does not know."""
+    """Prior probability that a robot that wakes up is at a place that its map does not know; that
+    a visit to a known place is not recognised as one; and that who is outside comes back in."""
     carried_share: float = Field(default=0.003, gt=0.0, lt=1.0)
     """Prior probability that a robot whose scans do not fit any more has been carried elsewhere: of
     some 20 losses of track in 5,000 scans of a `long` world none was, and few robots ever are."""
     max_carried_areas: int = Field(default=32, ge=1)
     """Most known areas that it may have been carried to: the nearest."""
+    searched_mass: float = Field(default=0.01, gt=0.0, lt=1.0)
+    """A hypothesis looks all over the map for where the robot is only if it is so probable that it
+    is there, and nothing says where: that costs more than all else."""
     look_alike_share: float = Field(default=0.3, ge=0.0, lt=1.0)
     """Prior probability that a place that is new looks like one that is known: 9 of 40 do in a
     `long` world, 4 of 14 in a warehouse, all 7 in twin buildings, none of 12 in recorded

@@ -7,11 +7,14 @@ References:
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import compress
 
 import numpy as np
+import numpy.typing as npt
+from scipy.spatial import cKDTree
 
 from hmt_service.core.alignment import Aligner, Mode
 from hmt_service.core.awakening import anywhere_in, beside_keyframes, is_anywhere, put_down
@@ -36,6 +39,10 @@ from hmt_service.core.visits import Visits, gaps_m
 
 # So many times as many areas are looked at as may be candidates.
 _ASKED = 4
+# Who was there for more of a visit was in a known area.
+_MOSTLY = 0.5
+# Keyframes are so near each other that every third says where a path was.
+_EVERY = 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -116,6 +123,30 @@ class _Question:
         """Visits whose place beside the visit follows from the motion."""
         return frozenset() if self.is_open else self.hypothesis.graph.part_of(self.known)
 
+    def outside_before(self) -> FloatArray:
+        """Return where the robot has just been outside all areas known by then, if it was.
+
+        Returns:
+            Some positions in the frame of the visit, shape (N, 3), m.
+        """
+        current = self.hypothesis.current
+        is_asked = self.is_open or self.known == self.visit.visit
+        if is_asked or current.area_from_visit is not None or current.visit != self.known:
+            return np.zeros((0, 3))
+        path = _path_of(self.visits[self.known])[::-_EVERY]
+        visit_from_known = inverse(self.known_from_visit.mean)
+        return path @ visit_from_known[:3, :3].T + visit_from_known[:3, 3]
+
+    def paths_from(self, area: int, others: Sequence[int]) -> FloatArray:
+        """Return where the robot has been in some areas, in the frame of one, shape (N, 3), m."""
+        poses = self.hypothesis.graph.poses()
+        paths = []
+        for other in others:
+            area_from_other = inverse(poses[area]) @ poses[other]
+            path = _path_of(self.visits[other])
+            paths.append(path @ area_from_other[:3, :3].T + area_from_other[:3, 3])
+        return np.concatenate(paths)
+
     @property
     def is_carried_here(self) -> bool:
         """Whether it was carried to this part of the map: from nearby, not across a whole site."""
@@ -132,6 +163,30 @@ class _Candidate:
     """What the prior consists of, in equal shares and equally wide, if that is not one Gaussian."""
     mass: float = 1.0
     """Prior probability of the area where it is not in the pose: nothing else says where it is."""
+
+
+def _path_of(visit: Visit) -> FloatArray:
+    """Return where the robot has been in a visit, shape (K, 3), m."""
+    return np.array([pose.mean[:3, 3] for pose in visit.visit_from_keyframe])
+
+
+def _is_beside(
+    poses: FloatArray, positions: FloatArray, path: FloatArray, reach_m: float
+) -> npt.NDArray[np.bool_]:
+    """Return whether positions, moved by poses, are near a path.
+
+    Args:
+        poses: Shape (S, 4, 4).
+        positions: Shape (N, 3), m.
+        path: Shape (K, 3), m.
+        reach_m: How near.
+
+    Returns:
+        Shape (S, N).
+    """
+    moved = positions @ np.swapaxes(poses[:, :3, :3], 1, 2) + poses[:, None, :3, 3]
+    distances, _ = cKDTree(path).query(moved, distance_upper_bound=reach_m)
+    return np.asarray(distances <= reach_m)
 
 
 class Transition:
@@ -153,7 +208,7 @@ class Transition:
             rng: Source of the samples of the prior.
         """
         self._config = config.transition
-        self._log_unlikely = math.log(config.particles.unlikely_mass)
+        self._unlikely = config.particles.unlikely_mass
         self._least_outside = 1.0 / (config.transition.prior_samples + 1)
         self._refinement = config.refinement
         self._beams = config.observation
@@ -206,11 +261,13 @@ class Transition:
         """Return every place that the new visit may be to if the motion is to be believed."""
         where = _Question(hypothesis, visit, arc.visit_a, arc.a_from_b, visits, is_carried)
         candidates = self._candidates(where)
-        outside = self._mass_outside(candidates, visit, visits)
+        masses = self._masses_inside(where, candidates)
+        outside = self._clipped(1.0 - sum(masses))
         # Who wakes up is in the map or outside; who has been outside goes on there.
         new = outside * self._config.outside_share if where.is_open else outside
         found = self._found(where, new)
-        matches = self._matches(visit, candidates, visits)
+        likely = compress(candidates, [self._is_asked(where, mass) for mass in masses])
+        matches = self._matches(visit, list(likely), visits)
         # What is new where all is known has changed, and looks like no other place for that. Nor
         # does it if the heading is unknown: a bound of the motion alone favours what is far away.
         is_new_space = outside > self._least_outside and (where.is_open or where.is_heading_known)
@@ -235,14 +292,19 @@ class Transition:
         candidates = self._candidates(
             where, is_asked=lambda prior: not is_certain(prior, self._refinement)
         )
+        if not self._is_asked(where, 0.0):
+            masses = self._masses_inside(where, candidates)
+            asked = [self._is_asked(where, mass) for mass in masses]
+            candidates = list(compress(candidates, asked))
         matches, found = self._matches(visit, candidates, visits), self._found(where, 1.0)
         return Places((*matches, *found.successors), found.log_searched)
 
     def _found(self, where: _Question, outside: float) -> Places:
         """Return the places that nothing leads to but what the visit saw."""
-        # A search of the map costs more than all else, and what is unlikely is soon forgotten.
-        is_asked = where.hypothesis.log_weight >= self._log_unlikely
-        candidates = self._anywhere(where, outside) if is_asked else []
+        odds = self._odds_inside(where)
+        mass = math.exp(where.hypothesis.log_weight) * odds / (1.0 + odds)
+        is_asked = mass >= self._config.searched_mass
+        candidates = self._anywhere(where, outside * odds) if is_asked else []
         if not candidates:
             return Places(())
         matches = self._matches(where.visit, candidates, where.visits)
@@ -250,6 +312,26 @@ class Transition:
             tuple(replace(match, is_found=True) for match in matches),
             math.log(sum(candidate.mass for candidate in candidates)),
         )
+
+    def _odds_inside(self, where: _Question) -> float:
+        """Return how much more probable it is to be in what nothing leads to than outside.
+
+        Each visit that was not recognised since the robot woke up, or was put down, makes it less
+        probable that he has been there all the time.
+        """
+        share, asked = self._config.outside_share, int(where.known == where.visit.visit)
+        missed = max(len(where.part) - asked, 0)
+        return max((1.0 - share) / share * share**missed, share)
+
+    def _is_asked(self, where: _Question, mass: float) -> bool:
+        """Return whether a place is worth a look: none is that is unlikely from the start.
+
+        Args:
+            where: What is asked.
+            mass: Probability that the robot is there, says the hypothesis.
+        """
+        at_least = max(mass, self._least_outside)
+        return math.exp(where.hypothesis.log_weight) * at_least >= self._unlikely
 
     def _matches(
         self,
@@ -308,7 +390,7 @@ class Transition:
         is_known = not is_lost and is_certain(where.known_from_visit, self._refinement)
         return known if is_known and where.hypothesis.current.area == known else None
 
-    def _anywhere(self, where: _Question, outside: float) -> list[_Candidate]:
+    def _anywhere(self, where: _Question, inside: float) -> list[_Candidate]:
         """Return the areas that the visit may be to because nobody knows where those are.
 
         A robot that wakes up is as likely beside one keyframe of the map as beside another, and may
@@ -316,9 +398,9 @@ class Transition:
 
         Args:
             where: What is asked.
-            outside: Probability that it is in no area at all.
+            inside: Probability that it is in any of them.
         """
-        visits, share = where.visits, self._config.outside_share
+        visits = where.visits
         areas = [area for area in where.hypothesis.topology.areas if area not in where.part]
         most = self._config.max_carried_areas
         if where.is_carried_here and len(areas) > most:
@@ -327,7 +409,6 @@ class Transition:
             away_m = np.linalg.norm(positions[areas] - positions[where.known], axis=1)
             areas = [areas[i] for i in np.sort(np.argsort(away_m, kind="stable")[:most])]
         keyframes = sum(visits.keyframes(area) for area in areas)
-        inside = outside * (1.0 - share) / share
         return [
             _Candidate(
                 area,
@@ -338,24 +419,36 @@ class Transition:
             for area in areas
         ]
 
-    def _mass_outside(
-        self, candidates: list[_Candidate], visit: Visit, visits: Mapping[int, Visit]
-    ) -> float:
-        """Return the prior probability that the robot is in no known area, never quite 0 or 1."""
-        samples = self._config.prior_samples
-        body_in_visit = visit.visit_from_keyframe[-1].mean[:3, 3]
-        inside = 0.0
+    def _clipped(self, probability: float) -> float:
+        """Return a probability that is never quite 0 or 1: it comes from samples."""
+        return min(max(probability, self._least_outside), 1.0 - self._least_outside)
+
+    def _masses_inside(self, where: _Question, candidates: Sequence[_Candidate]) -> list[float]:
+        """Return the prior probability that the robot is in each candidate.
+
+        Who was outside until now has moved in only where the way there did: a place that he would
+        have had to be in before, too, is none.
+        """
+        samples, presence_m = self._config.prior_samples, self._config.presence_m
+        now = where.visit.visit_from_keyframe[-1].mean[:3, 3]
+        others = [c.area for c in candidates if c.area != where.known]
+        before = where.outside_before() if others else np.zeros((0, 3))
+        inside = []
         for candidate in candidates:
             prior = candidate.area_from_visit
             noise = self._rng.multivariate_normal(
                 np.zeros(6), prior.covariance, size=samples, method="cholesky"
             )
             area_from_visit = prior.mean @ exp(noise)
-            positions = area_from_visit[:, :3, :3] @ body_in_visit + area_from_visit[:, :3, 3]
-            known = np.array([p.mean[:3, 3] for p in visits[candidate.area].visit_from_keyframe])
-            distances = np.linalg.norm(positions[:, None] - known[None], axis=2).min(axis=1)
-            inside += float(np.mean(distances <= self._config.presence_m))
-        return float(np.clip(1.0 - inside, self._least_outside, 1.0 - self._least_outside))
+            area = where.visits[candidate.area]
+            is_in = _is_beside(area_from_visit, now[None], _path_of(area), presence_m)[:, 0]
+            was_out = np.ones(samples, dtype=bool)
+            if len(before):
+                paths = where.paths_from(candidate.area, others)
+                was_in = _is_beside(area_from_visit, before, paths, presence_m)
+                was_out = was_in.mean(axis=1) <= _MOSTLY
+            inside.append(int(np.sum(is_in & was_out)) / max(int(np.sum(was_out)), 1))
+        return inside
 
     def _log_factor(self, visit: Visit, target: Visit, candidate: _Candidate, mode: Mode) -> float:
         """Return the log of the Laplace integral of prior times likelihood around one mode."""

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from hmt_service.core.alignment import Aligner, Mode
+from hmt_service.core.awakening import put_down
 from hmt_service.core.config import load_config
 from hmt_service.core.geometry import GaussianPose, Pose, identity, inverse, log, planar_pose
 from hmt_service.core.graph import Factor, PoseGraph
@@ -209,3 +211,56 @@ def test_finished_visit_is_recognised_where_its_place_is_in_doubt() -> None:
 def test_finished_visit_whose_place_is_known_is_left_to_refinement() -> None:
     path = line(planar_pose(0.5, -0.5, 1.0), length_m=1.0)
     assert recognitions_of(0.05, path) == ()
+
+
+def beside_a_known_row(*, has_returned: bool) -> float:
+    """Return the probability of a new area in a row beside another one, which is not well known.
+
+    Args:
+        has_returned: Whether the visit before was to the row that is known.
+    """
+    row = line(planar_pose(100.0, 0.0, 0.0), length_m=12.0)
+    back = line(planar_pose(110.0, 5.0, math.pi), length_m=5.0)
+    hypothesis, visits = explored(row, back, sigma_m=4.0)
+    if has_returned:
+        there = hypothesis.graph.relative(0, 1)
+        topology = Topology((Assignment(0, 0, None), Assignment(1, 0, there)))
+        hypothesis = replace(hypothesis, topology=topology)
+    further = line(planar_pose(105.0, 5.0, math.pi), length_m=2.0)
+    found = successors_of(hypothesis, visits, further, inverse(back[0]) @ further[0])
+    return math.exp(found[0].log_factor)
+
+
+def test_who_was_outside_has_not_moved_in_where_he_would_have_been_in_before() -> None:
+    assert beside_a_known_row(has_returned=True) < 0.93
+    assert beside_a_known_row(has_returned=False) > 0.96
+
+
+def test_what_is_unlikely_is_not_compared_with_what_is_vaguely_near() -> None:
+    hypothesis, visits = explored(IN_ROOM, line(planar_pose(30.0, 0.0, 0.0), length_m=1.0))
+    motion = inverse(planar_pose(30.0, 0.0, 0.0)) @ planar_pose(20.0, 0.2, 0.0)
+    unlikely = replace(hypothesis, log_weight=math.log(0.01))
+    (new,) = successors_of(
+        unlikely, visits, IN_ROOM, motion, sigma_m=10.0, aligner=NoAligner(CONFIG)
+    )
+    assert new.area is None
+    with pytest.raises(AssertionError, match="visit 2 was compared"):
+        successors_of(hypothesis, visits, IN_ROOM, motion, sigma_m=10.0, aligner=NoAligner(CONFIG))
+
+
+@pytest.mark.parametrize(("visits", "odds"), [(1, 9.0), (2, 0.9), (3, 0.1), (4, 0.1)])
+def test_who_was_not_recognised_for_long_is_outside(visits: int, odds: float) -> None:
+    path = line(planar_pose(60.0, 0.0, 0.0), length_m=1.0)
+    hypothesis, known = explored(IN_ROOM)
+    for number in range(1, visits + 1):
+        known[number] = visit_along(WORLD, path, visit=number)
+        arc = Factor(number - 1, number, gaussian(identity(), sigma_m=0.1))
+        if number == 1:
+            arc = put_down(arc, is_planar=True)
+        hypothesis = hypothesis.extended(
+            Assignment(number, number, None), arc, hypothesis=0, log_weight=0.0
+        )
+    observation = ObservationModel(CONFIG.observation, CONFIG.sensor)
+    transition = Transition(CONFIG, Aligner(CONFIG), observation, np.random.default_rng(0))
+    places = transition.recognitions(hypothesis, known[visits], Visits(known.values()))
+    assert math.exp(places.log_searched) == pytest.approx(odds)
