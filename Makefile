@@ -20,7 +20,7 @@ demo: $(INSTALLED)
 	$(BIN)/hmt demo --out out/demo
 
 test: $(INSTALLED)
-	$(BIN)/pytest
+	$(BIN)/pytest -n 2 --dist loadfile
 
 lint: $(INSTALLED) proto-is-fresh
 	$(BIN)/ruff format --check .

@@ -88,11 +88,11 @@ class Awakening:
     found_m: float | None
     """Way until the right place was certain; None if it never was."""
     wrong: float
-    """Largest probability of wrong places on the way there, since it was noticed."""
+    """Largest probability of a wrong place on the way there, since it was noticed."""
     is_noticed: bool
     """Whether the odometry found out that it was lost; a new session always is."""
     decisions: tuple[Decision, ...]
-    """What was believed at each keyframe on the way, since it was noticed."""
+    """What was believed at each keyframe of the first 10 m, since it was noticed."""
 
 
 def measure(run: Run) -> Report:
@@ -226,7 +226,7 @@ def _known_places(known: StoredMap, readings: Sequence[Reading], truth: Truth) -
 def awaken(
     known: StoredMap, readings: Iterable[Reading], truth: Truth, config: Config
 ) -> Awakening:
-    """Go on with a map from an unknown place until that is certain, or for 25 m.
+    """Go on with a map from an unknown place for 10 m, and until that is certain, at most 25 m.
 
     Args:
         known: The map.
@@ -245,7 +245,7 @@ def _find(
     steps: Iterable[tuple[Reading, Pose]],
     truth: Truth,
 ) -> Awakening:
-    """Go on until the right place is certain, or for 25 m; see `awaken`.
+    """Go on for 10 m, and until the right place is certain, but not beyond 25 m; see `awaken`.
 
     Args:
         engine: Holds the map.
@@ -256,6 +256,7 @@ def _find(
     """
     places = np.array([truth.at(keyframe.stamp_s) for keyframe in known.keyframes])
     travelled_m = worst = 0.0
+    found_m: float | None = None
     decisions: list[Decision] = []
     before: Pose | None = None
     is_lost = False
@@ -272,17 +273,21 @@ def _find(
         if tracking.keyframe is None or not is_lost:
             continue
         decision = _decision(engine.stored(), places, here)
-        decisions.append(decision)
-        worst = max(worst, sum(o.probability for o in decision.options if _is_wrong_place(o)))
-        if probability_right(decision) > _CERTAIN:
-            return Awakening(travelled_m, worst, is_lost, tuple(decisions))
-        if travelled_m > _LONGEST_M:
+        if found_m is None:
+            worst = max(worst, _of_wrong_place(decision))
+            found_m = travelled_m if probability_right(decision) > _CERTAIN else None
+        # As far for everybody: who is found early must not count less.
+        if travelled_m <= _WITHIN_M:
+            decisions.append(decision)
+        elif found_m is not None or travelled_m > _LONGEST_M:
             break
-    return Awakening(None, worst, is_lost, tuple(decisions))
+    return Awakening(found_m, worst, is_lost, tuple(decisions))
 
 
-def _is_wrong_place(option: Option) -> bool:
-    return option.is_known and not option.is_right
+def _of_wrong_place(decision: Decision) -> float:
+    """Return the probability of the wrong place of the map that is believed most."""
+    wrong = [o.probability for o in decision.options if o.is_known and not o.is_right]
+    return max(wrong, default=0.0)
 
 
 def _decision(stored: StoredMap, places: FloatArray, here: Pose) -> Decision:

@@ -32,10 +32,11 @@ FIGURE = "scaling.png"
 """Name of the figure."""
 
 _SEED = 0
-# As few scans per area as fill it: each is a keyframe, and sees little more than its room.
+# As few beams as fill an area, which see little more than their room. Who scans half as often
+# loses track at every tenth door.
 _BEAMS = 181
 _MAX_RANGE_M = 8.0
-_SCAN_PERIOD_S = 0.5
+_SCAN_PERIOD_S = 0.25
 _SPEED_M_S = 1.1
 _GROWTH_TOLERANCE = 1.0
 _SIZE_TOLERANCE = 0.2

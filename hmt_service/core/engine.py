@@ -41,7 +41,7 @@ from hmt_service.core.hypotheses import (
     Topology,
 )
 from hmt_service.core.kernels import compile_kernels
-from hmt_service.core.observation import ObservationModel
+from hmt_service.core.observation import Look, ObservationModel
 from hmt_service.core.plausibility import Plausibility
 from hmt_service.core.refinement import Refinement
 from hmt_service.core.smoothing import Smoother
@@ -439,20 +439,22 @@ class Engine:
     def _said(self, number: int) -> dict[int, float]:
         """Return what a keyframe of the open visit says for each hypothesis."""
         hypotheses, news = self._particles.hypotheses, self._open.news_of(number)
-        evidence = {h.hypothesis: self._evidence(h, news, number) for h in hypotheses}
-        return evidence | _like_found(hypotheses, evidence)
+        looks = {h.hypothesis: self._look(h, news, number) for h in hypotheses}
+        evidence = {h: look.log_ratio for h, look in looks.items()}
+        return evidence | _like_found(hypotheses, looks)
 
-    def _evidence(self, hypothesis: Hypothesis, news: News, number: int) -> float:
+    def _look(self, hypothesis: Hypothesis, news: News, number: int) -> Look:
         """Return what the news of a keyframe say for a hypothesis, against the background."""
         visit, area = self._open, hypothesis.current.area
         if area == visit.visit:
             if hypothesis.sees is None:
-                return 0.0
+                return Look(0.0, 0.0)
             area = hypothesis.sees
         area_from_visit = inverse(hypothesis.graph.pose(area)) @ hypothesis.graph.pose(visit.visit)
         pose = area_from_visit @ visit.visit_from_keyframe[number].mean
         known = self._visits[area].known_from(pose[:3, 3])
-        return news.share * self._observation.log_ratio(news.keyframe, known, pose)
+        look = self._observation.look(news.keyframe, known, pose)
+        return replace(look, log_ratio=news.share * look.log_ratio)
 
     def _unweigh(self, keyframes: Sequence[Keyframe]) -> None:
         """Take back what keyframes said as part of a visit that they turned out not to be in."""
@@ -981,6 +983,8 @@ class Engine:
 
 
 _ANY_CUT = 2.0
+# A place of which so much is known can tell what one that looks like it would look like.
+_MOSTLY_KNOWN = 0.5
 # From so many keyframes on there is more to see than at first.
 _LEAST_LOOK = 4
 # A gap that the wheels bridge so well is none.
@@ -1055,19 +1059,25 @@ def _known_place(match: Successor) -> tuple[int, GaussianPose]:
     return match.area, match.area_from_visit
 
 
-def _like_found(
-    hypotheses: Sequence[Hypothesis], evidence: Mapping[int, float]
-) -> dict[int, float]:
-    """Return what a keyframe says for new areas that look like known ones, against the background.
+def _like_found(hypotheses: Sequence[Hypothesis], looks: Mapping[int, Look]) -> dict[int, float]:
+    """Return what a keyframe says where nobody knows, as the places tell where the robot was found.
 
-    They look like each as probably as the robot was found there.
+    New areas may look like these, like each as probably as the robot is there. And the places
+    themselves, which look alike as far as they are known, go on to do so where one of them is not:
+    that another one is known better is no evidence for it.
     """
     found = [h for h in hypotheses if h.is_found]
+    knowing = [h for h in found if looks[h.hypothesis].covered >= _MOSTLY_KNOWN]
     if not found:
         return {}
-    like = _log_mean(found, [evidence[h.hypothesis] for h in found])
+    like = _log_mean(knowing, [looks[h.hypothesis].log_ratio for h in knowing]) if knowing else 0.0
+    said = {
+        h.hypothesis: looks[h.hypothesis].log_ratio + (1.0 - looks[h.hypothesis].covered) * like
+        for h in found
+    }
+    new = _log_mean(found, [said[h.hypothesis] for h in found])
     unlike = [h for h in hypotheses if h.log_unlike is not None]
-    return {h.hypothesis: h.log_likelihood_of_like(like) for h in unlike}
+    return said | {h.hypothesis: h.log_likelihood_of_like(new) for h in unlike}
 
 
 def _resembling(

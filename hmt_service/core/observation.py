@@ -7,6 +7,8 @@ References:
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from hmt_service.core.config import ObservationConfig, SensorConfig
@@ -42,6 +44,16 @@ class BackgroundDensity:
         return np.clip((ranges / _BIN_M).astype(np.int64), 0, len(self._counts) - 1)
 
 
+@dataclass(frozen=True, slots=True)
+class Look:
+    """What one keyframe says for a place."""
+
+    log_ratio: float
+    """log p(z | x, submap) - log p0(z)."""
+    covered: float
+    """How much could be said: the rest of what was seen there is not known of the place."""
+
+
 class ObservationModel:
     """Likelihood ratio of scans: a known place against the background."""
 
@@ -63,7 +75,11 @@ class ObservationModel:
         self.background.learn(_ranges(keyframe.points_in_body - keyframe.sensor_in_body))
 
     def log_ratio(self, keyframe: Keyframe, submap: SeenPoints, submap_from_body: Pose) -> float:
-        """Return log p(z | x, submap) - log p0(z) of one keyframe, tempered for correlated beams.
+        """Return log p(z | x, submap) - log p0(z) of one keyframe; see `look`."""
+        return self.look(keyframe, submap, submap_from_body).log_ratio
+
+    def look(self, keyframe: Keyframe, submap: SeenPoints, submap_from_body: Pose) -> Look:
+        """Return what one keyframe says for a place, tempered for correlated beams.
 
         Beams into space that the submap does not know say nothing: there, both follow p0. The
         others say what all would, if they are many: how much of a place was seen through a door is
@@ -76,7 +92,7 @@ class ObservationModel:
         """
         rays = keyframe.points_in_body - keyframe.sensor_in_body
         if not len(rays):
-            return 0.0
+            return Look(0.0, 1.0)
         ranges = _ranges(rays)
         predicted = transform_points(inverse(submap_from_body), submap.points)
         predicted -= keyframe.sensor_in_body
@@ -84,12 +100,13 @@ class ObservationModel:
         expected = self._expectations(predicted, directions, rays)
         is_known = np.isfinite(expected[1])
         if not np.any(is_known):
-            return 0.0
+            return Look(0.0, 0.0)
         density = self._hit_density(ranges[is_known], expected[:, is_known])
         hit = self._config.hit_weight
         ratio = np.log(hit * density / self.background.density(ranges[is_known]) + (1.0 - hit))
         covered = min(1.0, float(np.mean(is_known)) / _COVERED)
-        return float(ratio.mean() * covered * min(len(rays), self._config.independent_beams))
+        beams = min(len(rays), self._config.independent_beams)
+        return Look(float(ratio.mean() * covered * beams), covered)
 
     def _hit_density(self, ranges: FloatArray, expected: FloatArray) -> FloatArray:
         """Return the density of each range, shape (N,), 1/m: the mean over its expectations."""
