@@ -38,6 +38,16 @@ from tests.core.factories import (
 from tests.mapped import mapped
 
 LATER_S = 1000.0
+BENT = np.concatenate(
+    [
+        box(0.0, 0.0, 10.0, 8.0),
+        [[0.0, 3.0, 7.0, 3.0], [7.0, 3.0, 7.0, 8.0]],
+        box(0.0, 0.8, 0.6, 1.6),
+        box(3.0, 2.4, 3.8, 3.0),
+        box(7.0, 6.0, 7.5, 6.6),
+    ]
+)
+"""A hall that goes on around a corner."""
 
 
 def carried(before: Sequence[Pose], after: Sequence[Pose], settings: str = "") -> Engine:
@@ -77,6 +87,26 @@ def ring() -> Engine:
             engine.process(tracking)
     engine.finish()
     return engine
+
+
+def test_a_place_that_is_known_better_than_one_like_it_gains_nothing_by_that() -> None:
+    # Two halls that are equal; of one the map knows what lies around the corner.
+    ahead = line(planar_pose(1.5, 1.2, 0.0), length_m=3.0)
+    turning = line(planar_pose(5.0, 1.4, 0.1), length_m=3.0)
+    around = [*ahead, *turning, *line(planar_pose(8.4, 2.0, 1.5), length_m=4.0)]
+    other, there = shifted(BENT, 60.0), planar_pose(60.0, 0.0, 0.0)
+    motion = gaussian(inverse(around[-1]) @ there @ ahead[0], sigma_m=0.5)
+    mapping = trackings_of(
+        (BENT, around, certain(identity())), (other, [there @ pose for pose in ahead], motion)
+    )
+    engine = Engine.restored(processed(mapping)[0].stored())
+    asleep = trackings_of((other, [there @ pose for pose in around], certain(identity())))
+    for tracking in asleep:
+        engine.process(tracking)
+        hypotheses = engine.stored().hypotheses
+        for area in (0, 1):
+            inside = [h.log_weight for h in hypotheses if h.assignments[-1].area == area]
+            assert np.sum(np.exp(inside)) > 0.25
 
 
 def test_each_way_to_be_in_one_place_is_a_hypothesis_of_its_own() -> None:
