@@ -48,6 +48,8 @@ _LEAST_S, _MOST_S = 0.1, 3.0
 _RESTART_S = 0.2
 """What the service manager waits (RestartSec of `deploy/systemd/hmt.service`)."""
 _DEADLINE_S = 60.0
+_LOGGED = 4_000
+"""Characters of its log that are told if it does not come back."""
 _POLL_S = 0.02
 _LOWER = Direction.LOWER_IS_BETTER
 _TOLERANCE = 0.5
@@ -124,6 +126,7 @@ class _Service:
 
     def __init__(self, map_file: Path) -> None:
         self.map_file = map_file
+        self.log_file = map_file.with_suffix(".log")
         self.endpoint = free_endpoint()
         self._process: subprocess.Popen[bytes] | None = None
 
@@ -133,6 +136,9 @@ class _Service:
         try:
             _wait(lambda: is_running(self.endpoint))
             yield
+        except DaemonFailure as error:
+            last = self.log_file.read_text()[-_LOGGED:]
+            raise DaemonFailure(f"{error}; what the service said last: {last}") from error
         finally:
             self.kill()
 
@@ -140,8 +146,8 @@ class _Service:
         command = [sys.executable, "-m", "hmt_service", "serve", "--listen", self.endpoint]
         command += ["--map", str(self.map_file)]
         environment = {n: text for n, text in os.environ.items() if not n.startswith("HMT_")}
-        silent = subprocess.DEVNULL
-        self._process = subprocess.Popen(command, stdout=silent, stderr=silent, env=environment)
+        with self.log_file.open("ab") as log:
+            self._process = subprocess.Popen(command, stdout=log, stderr=log, env=environment)
 
     def kill(self) -> None:
         if self._process is not None:
@@ -197,12 +203,16 @@ def _is_whole(client: HmtClient) -> bool:
 
 def _wait(is_true: Callable[[], bool]) -> None:
     deadline_s = time.perf_counter() + _DEADLINE_S
+    why = "it answers"
     while time.perf_counter() < deadline_s:
-        with suppress(Unavailable):
+        try:
             if is_true():
                 return
+            why = "it answers"
+        except Unavailable as error:
+            why = str(error)
         time.sleep(_POLL_S)
-    raise DaemonFailure(f"the service is not whole again after {_DEADLINE_S:g} s")
+    raise DaemonFailure(f"the service is not whole again after {_DEADLINE_S:g} s: {why}")
 
 
 def _metrics(source: str, result: Result) -> Iterator[Metric]:

@@ -208,7 +208,7 @@ class Transition:
             rng: Source of the samples of the prior.
         """
         self._config = config.transition
-        self._unlikely = config.particles.unlikely_mass
+        self._negligible = config.particles.negligible_mass
         self._least_outside = 1.0 / (config.transition.prior_samples + 1)
         self._refinement = config.refinement
         self._beams = config.observation
@@ -324,14 +324,14 @@ class Transition:
         return max((1.0 - share) / share * share**missed, share)
 
     def _is_asked(self, where: _Question, mass: float) -> bool:
-        """Return whether a place is worth a look: none is that is unlikely from the start.
+        """Return whether a place is worth a look: none is whose mass is negligible from the start.
 
         Args:
             where: What is asked.
             mass: Probability that the robot is there, says the hypothesis.
         """
         at_least = max(mass, self._least_outside)
-        return math.exp(where.hypothesis.log_weight) * at_least >= self._unlikely
+        return math.exp(where.hypothesis.log_weight) * at_least >= self._negligible
 
     def _matches(
         self,

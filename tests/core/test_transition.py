@@ -239,7 +239,7 @@ def test_who_was_outside_has_not_moved_in_where_he_would_have_been_in_before() -
 def test_what_is_unlikely_is_not_compared_with_what_is_vaguely_near() -> None:
     hypothesis, visits = explored(IN_ROOM, line(planar_pose(30.0, 0.0, 0.0), length_m=1.0))
     motion = inverse(planar_pose(30.0, 0.0, 0.0)) @ planar_pose(20.0, 0.2, 0.0)
-    unlikely = replace(hypothesis, log_weight=math.log(0.01))
+    unlikely = replace(hypothesis, log_weight=math.log(1e-5))
     (new,) = successors_of(
         unlikely, visits, IN_ROOM, motion, sigma_m=10.0, aligner=NoAligner(CONFIG)
     )
