@@ -58,6 +58,7 @@ class Name(StrEnum):
     LAPS = "laps"
     LATENCY = "latency"
     OUTAGES = "outages"
+    LOAD = "load"
 
 
 def _measure_in_module(name: Name, run: Run) -> Report:

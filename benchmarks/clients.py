@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from enum import StrEnum
@@ -142,11 +143,37 @@ def stamp_of(payload: bytes, encoding: str) -> float:
     return pose.stamp_s
 
 
-def ask(endpoint: str, question: Question) -> list[float]:
+def ask(endpoint: str, question: Question, *, for_s: float = TURN_S) -> list[float]:
     """Ask one question at its pace for one turn; return how long each answer took, s."""
     call, period_s = _ASK[question]
     with HmtClient(endpoint, site=_SITE, robot=_ROBOT) as client:
-        return paced(lambda: call(client), period_s=period_s, for_s=TURN_S)
+        return paced(lambda: call(client), period_s=period_s, for_s=for_s)
+
+
+def ask_together(
+    endpoint: str, question: Question, *, clients: int, period_s: float, for_s: float
+) -> list[float]:
+    """Ask one question with several clients, each at the same pace.
+
+    Args:
+        endpoint: Where the daemon listens.
+        question: What all of them ask.
+        clients: How many there are; their turns are spread over the period.
+        period_s: Time between two questions of one of them.
+        for_s: Time after which no question has its turn.
+
+    Returns:
+        How long each answer took, s.
+    """
+    call, _ = _ASK[question]
+
+    def one(number: int) -> list[float]:
+        time.sleep(number * period_s / clients)
+        with HmtClient(endpoint, site=_SITE, robot=_ROBOT) as client:
+            return paced(lambda: call(client), period_s=period_s, for_s=for_s)
+
+    with ThreadPoolExecutor(clients) as threads:
+        return [latency_s for each in threads.map(one, range(clients)) for latency_s in each]
 
 
 def paced(
