@@ -299,7 +299,8 @@ class Odometry:
         allowed = fit.degenerate @ self._allowed @ fit.degenerate.T
         if drawn @ np.linalg.solve(allowed, drawn) <= _DRAWN2:
             return fit.pose
-        self._doubt = self._doubt + along @ correction
+        # What is not believed is not there for the next scan either: it says the same again.
+        self._doubt = along @ correction
         undrawn: Pose = predicted @ exp(correction - along @ correction)
         return undrawn
 

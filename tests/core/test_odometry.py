@@ -717,15 +717,34 @@ def test_scan_of_a_wrong_shape_is_refused(points: FloatArray, times: FloatArray 
 @pytest.mark.parametrize("seed", range(3))
 def test_walls_that_end_where_the_laser_does_hold_nobody_back(seed: int) -> None:
     # Of a blank corridor it always sees the same, and the ends of that come along.
-    path, rng = line(identity(), length_m=12.0, step_m=0.1), np.random.default_rng(seed)
-    readings: list[Reading] = []
-    for index, pose in enumerate(path):
-        points = points_from(CORRIDOR, pose, noise_m=rng.normal(0.0, 0.03, BEAMS))
-        seen = points[np.linalg.norm(points, axis=1) < 8.0]
-        readings += [OdometryReading(0.2 * index, pose), Scan(0.2 * index, seen, np.zeros(3))]
-    trackings = track(readings)
+    path = line(identity(), length_m=12.0, step_m=0.1)
+    trackings = track(in_blank_corridor(path, seed))
     motions = [t.keyframe.previous_from_body for t in trackings if t.keyframe is not None]
     end = reduce(lambda one, other: one @ other, motions) @ trackings[-1].keyframe_from_body
     error_m = abs(end.mean[0, 3] - 12.0)
     assert error_m < 1.0
     assert error_m < 3.0 * end.sigma_m
+
+
+def test_who_stands_in_a_blank_corridor_is_told_the_same_again() -> None:
+    driven = line(identity(), length_m=12.45, step_m=0.1)
+    readings = in_blank_corridor([*driven, *[driven[-1]] * 200], 0)
+    trackings = track(readings)
+    arrived, stood = trackings[len(driven) - 1], trackings[-1]
+    assert stood.keyframe_index == arrived.keyframe_index, "nothing new was seen"
+    # The wheels may have crept meanwhile: 0.02 m a scan, which adds up as noise does.
+    assert (
+        stood.keyframe_from_body.sigma_m
+        < arrived.keyframe_from_body.sigma_m + 1.5 * 0.02 * np.sqrt(200)
+    )
+
+
+def in_blank_corridor(path: Sequence[Pose], seed: int) -> list[Reading]:
+    """Drive along a corridor whose ends the laser does not see, wheels and scans at 5 Hz."""
+    readings: list[Reading] = []
+    rng = np.random.default_rng(seed)
+    for index, pose in enumerate(path):
+        points = points_from(CORRIDOR, pose, noise_m=rng.normal(0.0, 0.03, BEAMS))
+        seen = points[np.linalg.norm(points, axis=1) < 8.0]
+        readings += [OdometryReading(0.2 * index, pose), Scan(0.2 * index, seen, np.zeros(3))]
+    return readings
