@@ -19,11 +19,15 @@ from __future__ import annotations
 import bz2
 import gzip
 import math
+import re
 import zlib
+from array import array
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import pairwise
+from itertools import islice, pairwise
 from pathlib import Path
 from typing import BinaryIO
 
@@ -39,11 +43,14 @@ from hmt_service.core.geometry import (
 )
 from hmt_service.core.types import OdometryReading, Reading, Scan
 from hmt_service.errors import InvalidLog
-from hmt_service.io.malformed import Malformed
+from hmt_service.io.malformed import Malformed, Tally
+from hmt_service.io.streams import IN_EVERY_SCAN, Arrival, Mounting, Stream, Use
 
 _WORDS_IN_CONFIG = 7
 _WORDS_IN_TIME = 3
 _WORDS_BETWEEN_POSES_AND_TIME = 5
+_RAW_SCAN = b"RAWLASER1"
+_TAG = re.compile(rb"[A-Z][A-Z0-9_]*")
 _GZIP_MAGIC = b"\x1f\x8b"
 _BZIP2_MAGIC = b"BZh"
 
@@ -62,8 +69,25 @@ class CarmenLog:
     """Number of scans that are older than the scan before them in the file."""
     malformed: tuple[Malformed, ...]
     """Lines that were left out, in the order of the file."""
+    written: tuple[Arrival, ...]
+    """The readings in the order of the file."""
     unread: tuple[str, ...] = ()
     """Empty: all readings are read."""
+    notes: tuple[str, ...] = ()
+    """Empty: nothing is assumed."""
+    mounting: Mounting = IN_EVERY_SCAN
+    """Which frames there are: the format names none."""
+
+    def arrivals(self, tally: Tally) -> Iterator[Arrival]:
+        """Yield the readings in the order of the file, and count the lines that hold none."""
+        for line in self.malformed:
+            tally.add(("line", line.reason), line.place, line.reason)
+        yield from self.written
+
+    def sample(self, most: int) -> Iterator[Scan]:
+        """Yield at most so many scans, evenly spread over the log."""
+        scans = (reading for reading in self.readings if isinstance(reading, Scan))
+        return islice(scans, None, None, -(-self.scans // most))
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,16 +117,16 @@ def read_carmen(path: Path, *, min_range_m: float, max_range_m: float) -> Carmen
         InvalidLog: If the file cannot be opened or holds no usable scan.
     """
     limits = _Limits(min_range_m, max_range_m)
-    readings: list[Reading] = []
-    raw_scans: list[Reading] = []
+    written: list[Arrival] = []
+    raw_scans: list[Arrival] = []
     malformed: list[Malformed] = []
     number = 0
     try:
         with _open(path) as file:
             for number, line in enumerate(_whole_lines(file), 1):
                 try:
-                    target = raw_scans if line.startswith(b"RAWLASER1") else readings
-                    target += _parse(line, limits)
+                    target = raw_scans if line.startswith(_RAW_SCAN) else written
+                    target += _parse(line, f"line {number}", limits)
                 except _Malformed as reason:
                     malformed.append(Malformed(f"line {number}", str(reason)))
     except _Malformed as reason:
@@ -111,8 +135,9 @@ def read_carmen(path: Path, *, min_range_m: float, max_range_m: float) -> Carmen
         raise InvalidLog(f"cannot read {path}: {error.strerror}") from error
 
     # CARMEN's logger can write every scan twice, raw and with the robot's pose.
-    if not any(isinstance(reading, Scan) for reading in readings):
-        readings += raw_scans
+    if not any(isinstance(arrival.reading, Scan) for arrival in written):
+        written += raw_scans
+    readings = [arrival.reading for arrival in written]
     scan_stamps_s = [reading.stamp_s for reading in readings if isinstance(reading, Scan)]
     if not scan_stamps_s:
         first = f", the first: {malformed[0].reason}" if malformed else ""
@@ -125,7 +150,50 @@ def read_carmen(path: Path, *, min_range_m: float, max_range_m: float) -> Carmen
         odometry=len(readings) - len(scan_stamps_s),
         out_of_order=sum(later < earlier for earlier, later in pairwise(scan_stamps_s)),
         malformed=tuple(malformed),
+        written=tuple(written),
     )
+
+
+def carmen_streams(path: Path) -> tuple[Stream, ...]:
+    """Return the kinds of messages in a CARMEN log, by name, and what they are read for.
+
+    Raises:
+        InvalidLog: If the file cannot be opened.
+    """
+    times_s: defaultdict[bytes, array[float]] = defaultdict(lambda: array("d"))
+    counts: Counter[bytes] = Counter()
+    try:
+        with _open(path) as file:
+            for line in _whole_lines(file):
+                words = line.split()
+                if not words or not _TAG.fullmatch(words[0]):
+                    continue
+                counts[words[0]] += 1
+                # Whatever the message, its time is there.
+                with suppress(ValueError):
+                    times_s[words[0]].append(float(words[-_WORDS_IN_TIME]))
+    except _Malformed:
+        pass
+    except OSError as error:
+        raise InvalidLog(f"cannot read {path}: {error.strerror}") from error
+    has_others = bool(counts.keys() & {b"FLASER", b"ROBOTLASER1"})
+    return tuple(
+        Stream(
+            tag.decode(), "message", "text", *_use(tag, has_others), count, np.array(times_s[tag])
+        )
+        for tag, count in sorted(counts.items())
+    )
+
+
+def _use(tag: bytes, has_scans: bool) -> tuple[Use, str]:
+    """Return what messages are read for, and why, where there are others with scans or not."""
+    if tag == _RAW_SCAN:
+        return (Use.NOTHING, "there are other scans") if has_scans else (Use.SCANS, "no other scan")
+    if tag == b"ODOM":
+        return Use.ODOMETRY, "says where the robot is"
+    if tag in _PARSERS:
+        return Use.SCANS_AND_ODOMETRY, "every message says where the robot is"
+    return Use.NOTHING, ""
 
 
 def _open(path: Path) -> BinaryIO | gzip.GzipFile | bz2.BZ2File:
@@ -146,7 +214,7 @@ def _whole_lines(file: Iterable[bytes]) -> Iterator[bytes]:
         raise _Malformed(f"compressed stream is damaged: {error}") from error
 
 
-def _parse(line: bytes, limits: _Limits) -> tuple[Reading, ...]:
+def _parse(line: bytes, place: str, limits: _Limits) -> Iterable[Arrival]:
     """Return the readings on one line, none if it holds another message.
 
     Raises:
@@ -154,7 +222,8 @@ def _parse(line: bytes, limits: _Limits) -> tuple[Reading, ...]:
     """
     tag, *words = line.split() or [b""]
     parser = _PARSERS.get(tag)
-    return parser(_Words(words), limits) if parser else ()
+    readings = parser(_Words(words), limits) if parser else ()
+    return [Arrival(tag.decode(), place, reading) for reading in readings]
 
 
 class _Words:
@@ -253,7 +322,7 @@ _PARSERS: dict[bytes, Callable[[_Words, _Limits], tuple[Reading, ...]]] = {
     b"ODOM": _odom,
     b"FLASER": _flaser,
     b"ROBOTLASER1": _robotlaser1,
-    b"RAWLASER1": _rawlaser1,
+    _RAW_SCAN: _rawlaser1,
 }
 
 

@@ -10,6 +10,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -24,6 +25,12 @@ MAX_SENSOR_OFFSET_M = 1e3
 """Farther than any sensor from its robot: beyond it numbers lose their meaning."""
 NANOSECONDS = 10**9
 """Of a second."""
+TIME_FIELDS = ("t", "time", "timestamp", "offset_time")
+"""What drivers call the capture time of a point; the first of them is taken."""
+LONGEST_SWEEP_S = 1.0
+"""Times that say more than this are in a unit or of a clock that nobody knows."""
+_SINCE_EPOCH_S = 1e8  # larger times count from an epoch, not from the stamp
+_LARGEST_S = 1e12  # larger times are ns
 _MAX_ODOMETRY_M = 1e7  # the same of any robot from its start
 _MAX_WRONG_SHARE = 0.5
 # A range written with centimetres and rebuilt from coordinates must not fall off the end of the
@@ -203,6 +210,70 @@ def planar_scan(
     times = None if point_times is None else point_times[has_return]
     points_in_body = transform_points(body_from_sensor, points)
     return Scan(stamp_s, points_in_body, body_from_sensor[:3, 3], times)
+
+
+def cloud_scan(
+    stamp_s: float,
+    points: FloatArray,
+    times: npt.NDArray[Any] | None,
+    returns: Returns,
+    body_from_sensor: Pose,
+) -> tuple[Scan, dict[Defect, int]]:
+    """Return the scan of a LiDAR, stamped at the end of its sweep, and how many points are wrong.
+
+    Args:
+        stamp_s: Its stamp.
+        points: Points seen from the sensor, shape (N, 3), m; NaN or infinite without a return.
+        times: Capture time of each point, shape (N,), see `_sweep_of`; None: nobody says.
+        returns: Which points are returns.
+        body_from_sensor: Pose of the sensor.
+
+    Raises:
+        DefectError: If all points are NaN, or a time is not finite.
+    """
+    ranges, dropped = ranges_of(points)
+    has_return = returns.among(ranges)
+    point_times, late_s = None, 0.0
+    if times is not None:
+        point_times, late_s = _sweep_of(times[has_return], stamp_s)
+    points_in_body = transform_points(body_from_sensor, points[has_return])
+    scan = Scan(stamp_s + late_s, points_in_body, body_from_sensor[:3, 3], point_times)
+    return scan, dropped
+
+
+def _sweep_of(times: npt.NDArray[Any], stamp_s: float) -> tuple[FloatArray | None, float]:
+    """Return what the times of a cloud's points say.
+
+    Their unit follows from their type: whole numbers are ns, others s (ns where they are too large
+    for that), since the stamp or since the epoch.
+
+    Args:
+        times: Of the returns, shape (N,), in the unit that their type says.
+        stamp_s: Stamp of the cloud.
+
+    Returns:
+        Capture times as shares of the sweep, shape (N,), None if there is no motion in them; and by
+        how much its end is later than its stamp, s.
+
+    Raises:
+        DefectError: If a time is not finite.
+    """
+    if not len(times):
+        return None, 0.0
+    is_whole = times.dtype.kind in "iu"
+    # NaN that signals.
+    with np.errstate(invalid="ignore", over="ignore"):
+        exact = times.astype(np.int64 if is_whole else np.float64)
+        first, end = exact.min(), float(exact.max())
+        since_first = (exact - first).astype(np.float64)
+        took = since_first.max()
+    # From one end of the numbers to the other is farther than any of them is large.
+    if not (np.isfinite(first) and np.isfinite(end) and np.isfinite(took)) or took < 0.0:
+        raise DefectError(Defect.BAD_GEOMETRY)
+    end_s = end / NANOSECONDS if is_whole or abs(end) > _LARGEST_S else end
+    late_s = end_s - stamp_s if end_s > _SINCE_EPOCH_S else end_s
+    point_times = since_first / took if took > 0.0 else None
+    return point_times, late_s if abs(late_s) <= LONGEST_SWEEP_S else 0.0
 
 
 def row_type(fields: Mapping[str, tuple[str | None, int]], step: int) -> np.dtype[np.void]:

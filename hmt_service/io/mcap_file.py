@@ -20,14 +20,14 @@ import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.reader import SeekingReader
-from mcap.records import Channel, Chunk, ChunkIndex, McapRecord, Message, Schema
+from mcap.records import Channel, Chunk, ChunkIndex, McapRecord, Message, MessageIndex, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.summary import Summary
 
 from hmt_service.errors import InvalidLog
 from hmt_service.io.malformed import Tally
 from hmt_service.io.ros_messages import type_name
-from hmt_service.io.topic_log import ENCODINGS, Topic
+from hmt_service.io.topic_log import Recorded, Topic
 
 _OPCODE_AND_LENGTH_BYTES = 9
 # What the library and its decompressors raise on bytes that are no MCAP.
@@ -46,6 +46,9 @@ _DAMAGE = (
 class McapFile:
     """One MCAP file, opened anew by every method."""
 
+    form = "MCAP"
+    """Name of the format."""
+
     def __init__(self, path: Path) -> None:
         """Remember where the file is."""
         self.path = path
@@ -59,7 +62,7 @@ class McapFile:
         with self._open() as file:
             summary = _summary(file)
         if summary is None or summary.statistics is None:
-            return Counter(topic for topic, _ in self._messages(None, Tally()))
+            return Counter(message.topic for message in self._messages(None, Tally()))
         table = _Table(summary)
         counts: Counter[Topic] = Counter()
         for channel, count in summary.statistics.channel_message_counts.items():
@@ -67,17 +70,32 @@ class McapFile:
                 counts[topic] += count
         return counts
 
-    def messages(self, topics: Collection[Topic], tally: Tally) -> Iterator[tuple[Topic, bytes]]:
-        """Yield topic and payload of every message of these topics that can be read.
+    def messages(self, topics: Collection[Topic], tally: Tally) -> Iterator[Recorded]:
+        """Yield every message of these topics that can be read.
 
         Raises:
             InvalidLog: If the file cannot be opened.
         """
         return self._messages(frozenset(topics), tally)
 
-    def _messages(
-        self, topics: Collection[Topic] | None, tally: Tally
-    ) -> Iterator[tuple[Topic, bytes]]:
+    def times(self) -> Iterator[tuple[Topic, int]]:
+        """Yield topic and time of recording of every message, from the indexes where there are any.
+
+        Raises:
+            InvalidLog: If the file cannot be opened.
+        """
+        with self._open() as file:
+            summary = _summary(file)
+            chunks = summary.chunk_indexes if summary else []
+            if summary is None or not (chunks and all(c.message_index_offsets for c in chunks)):
+                yield from ((topic, time_ns) for topic, _, time_ns in self._messages(None, Tally()))
+                return
+            table = _Table(summary)
+            for channel, time_ns in _indexed(file, chunks):
+                if (topic := table.topic(channel)) is not None:
+                    yield topic, time_ns
+
+    def _messages(self, topics: Collection[Topic] | None, tally: Tally) -> Iterator[Recorded]:
         with self._open() as file:
             summary = _summary(file)
             table = _Table(summary)
@@ -92,7 +110,7 @@ class McapFile:
                     continue
                 topic = table.topic(record.channel_id)
                 if topic is not None and (topics is None or topic in topics):
-                    yield topic, record.data
+                    yield Recorded(topic, record.data, record.log_time)
 
     def _open(self) -> BinaryIO:
         try:
@@ -115,14 +133,14 @@ class _Table:
             self._channels[record.id] = record
 
     def topic(self, channel_id: int) -> Topic | None:
-        """Return the topic of a channel, None when it or its encoding is unknown."""
+        """Return the topic of a channel, None when it or its schema is unknown."""
         channel = self._channels.get(channel_id)
         schema = self._schemas.get(channel.schema_id) if channel else None
-        if channel is None or schema is None:
+        if channel is None or (schema is None and channel.schema_id):
             return None
-        if channel.message_encoding not in ENCODINGS:
-            return None
-        return Topic(channel.topic, type_name(schema.name), channel.message_encoding)
+        # Number 0 is no schema.
+        kind = type_name(schema.name) if schema else ""
+        return Topic(channel.topic, kind, channel.message_encoding)
 
 
 def _summary(file: BinaryIO) -> Summary | None:
@@ -147,6 +165,18 @@ def _chunks_with(
         # A file need not say what is in its chunks.
         if not chunk.message_index_offsets or not chunk.message_index_offsets.keys() <= others
     ]
+
+
+def _indexed(file: BinaryIO, chunks: Iterable[ChunkIndex]) -> Iterator[tuple[int, int]]:
+    """Yield channel and log time of what the message indexes tell, up to where one is damaged."""
+    for chunk in chunks:
+        for offset in chunk.message_index_offsets.values():
+            try:
+                file.seek(offset + _OPCODE_AND_LENGTH_BYTES)
+                index = MessageIndex.read(ReadDataStream(file))
+            except _DAMAGE:
+                break
+            yield from ((index.channel_id, time_ns) for time_ns, _ in index.records)
 
 
 def _by_time(file: BinaryIO, chunks: Iterable[ChunkIndex], tally: Tally) -> Iterator[McapRecord]:

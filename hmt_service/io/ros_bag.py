@@ -19,7 +19,7 @@ from rosbags import rosbag1, rosbag2
 from hmt_service.errors import InvalidLog
 from hmt_service.io.malformed import Tally
 from hmt_service.io.ros_messages import Serialization, type_name
-from hmt_service.io.topic_log import Topic
+from hmt_service.io.topic_log import Recorded, Topic
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
@@ -32,6 +32,7 @@ class RosBag:
         """Remember where the bag is."""
         self.path = path
         self._is_ros1 = path.suffix.lower() == ".bag" and not path.is_dir()
+        self.form = f"bag of ROS {1 if self._is_ros1 else 2}"
 
     def topics(self) -> Counter[Topic]:
         """Return how many messages every topic has.
@@ -45,14 +46,26 @@ class RosBag:
                 counts[self._topic(connection)] += connection.msgcount
         return counts
 
-    def messages(self, topics: Collection[Topic], tally: Tally) -> Iterator[tuple[Topic, bytes]]:
-        """Yield topic and payload of every message of these topics, up to where it is damaged.
+    def messages(self, topics: Collection[Topic], tally: Tally) -> Iterator[Recorded]:
+        """Yield every message of these topics, up to where the bag is damaged.
 
         Raises:
             InvalidLog: If the bag cannot be opened.
         """
+        return self._messages(frozenset(topics), tally)
+
+    def times(self) -> Iterator[tuple[Topic, int]]:
+        """Yield topic and time of recording of every message.
+
+        Raises:
+            InvalidLog: If the bag cannot be opened.
+        """
+        for topic, _, time_ns in self._messages(None, Tally()):
+            yield topic, time_ns
+
+    def _messages(self, topics: Collection[Topic] | None, tally: Tally) -> Iterator[Recorded]:
         with self._open() as reader:
-            wanted = [c for c in reader.connections if self._topic(c) in topics]
+            wanted = [c for c in reader.connections if topics is None or self._topic(c) in topics]
             # To the library none would be all.
             if not wanted:
                 return
@@ -68,8 +81,8 @@ class RosBag:
                     return
                 if message is None:
                     return
-                connection, _, payload = message
-                yield self._topic(connection), payload
+                connection, time_ns, payload = message
+                yield Recorded(self._topic(connection), payload, time_ns)
 
     def _topic(self, connection: Connection) -> Topic:
         encoding = Serialization.ROS1 if self._is_ros1 else Serialization.CDR

@@ -27,19 +27,19 @@ import numpy.typing as npt
 from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from hmt_service.core.geometry import FloatArray, Pose, identity, transform_points
-from hmt_service.core.types import Scan
+from hmt_service.core.geometry import FloatArray, Pose, identity
 from hmt_service.io.decoding import (
-    NANOSECONDS,
+    LONGEST_SWEEP_S,
+    TIME_FIELDS,
     Decoded,
     Defect,
     DefectError,
     Returns,
     check_angles,
     check_frame,
+    cloud_scan,
     odometry_reading,
     planar_scan,
-    ranges_of,
     row_type,
     stamp_of,
     wrong_beams,
@@ -78,13 +78,6 @@ _TRANSFORMS_DEFINITION = "geometry_msgs/TransformStamped[] transforms"
 _STORES = {Serialization.CDR: Stores.LATEST, Serialization.ROS1: Stores.ROS1_NOETIC}
 # Poses in these frames may jump (REP 105).
 _WORLD_FRAMES = frozenset({"map", "earth"})
-_TIME_FIELDS = ("t", "time", "timestamp", "offset_time")
-_LONGEST_SWEEP_S = 1.0
-"""Times that say more than this are in a unit or of a clock that nobody knows."""
-_SINCE_EPOCH_S = 1e8
-"""Larger times count from an epoch, not from the stamp."""
-_LARGEST_S = 1e12
-"""Larger times are ns."""
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 _FLOATS = (7, 8)
 
@@ -191,9 +184,9 @@ def _laser_scan(message: LaserScan, rules: _Rules) -> Decoded:
         has_return &= ranges < message.range_max
     point_times: FloatArray | None = None
     took_s = message.time_increment * (len(ranges) - 1)
-    if 0.0 < took_s <= _LONGEST_SWEEP_S:
+    if 0.0 < took_s <= LONGEST_SWEEP_S:
         # A laser that looks forward only is blind for the rest of its turn.
-        turn_s = message.scan_time if took_s < message.scan_time <= _LONGEST_SWEEP_S else took_s
+        turn_s = message.scan_time if took_s < message.scan_time <= LONGEST_SWEEP_S else took_s
         point_times = 1.0 - (took_s - message.time_increment * steps) / turn_s
         stamp_s += took_s
     body_from_sensor = rules.frames.body_from_sensor
@@ -210,15 +203,8 @@ def _point_cloud(message: PointCloud2, rules: _Rules) -> Decoded:
     with np.errstate(over="ignore", invalid="ignore"):
         for axis, name in enumerate("xyz"):
             points[:, axis] = rows[name]
-    ranges, dropped = ranges_of(points)
-    has_return = rules.returns.among(ranges)
-    point_times = None
-    for time in [name for name in _TIME_FIELDS if name in names][:1]:
-        point_times, late_s = _sweep(rows[time][has_return], stamp_s)
-        stamp_s += late_s
-    body_from_sensor = rules.frames.body_from_sensor
-    points_in_body = transform_points(body_from_sensor, points[has_return])
-    scan = Scan(stamp_s, points_in_body, body_from_sensor[:3, 3], point_times)
+    times = next((rows[name] for name in TIME_FIELDS if name in names), None)
+    scan, dropped = cloud_scan(stamp_s, points, times, rules.returns, rules.frames.body_from_sensor)
     return Decoded(scan, frame, dropped)
 
 
@@ -247,7 +233,7 @@ def _rows(message: PointCloud2) -> npt.NDArray[np.void]:
     floats = {kinds[number] for number in _FLOATS}
     fields = {
         name: (kinds.get(f.datatype), f.offset)
-        for name in ("x", "y", "z", *_TIME_FIELDS)
+        for name in ("x", "y", "z", *TIME_FIELDS)
         for f in message.fields
         if f.name == name
     }
@@ -266,38 +252,6 @@ def _rows(message: PointCloud2) -> npt.NDArray[np.void]:
     strides = message.row_step, step
     rows = np.ndarray((height, width), row_type(fields, step), data, strides=strides)
     return rows.reshape(-1)
-
-
-def _sweep(times: npt.NDArray[Any], stamp_s: float) -> tuple[FloatArray | None, float]:
-    """Return what the times of a cloud's points say.
-
-    Args:
-        times: Of the returns, shape (N,), in the unit that their type says.
-        stamp_s: Stamp of the cloud.
-
-    Returns:
-        Capture times as shares of the sweep, shape (N,), None if there is no motion in them; and by
-        how much its end is later than its stamp, s.
-
-    Raises:
-        DefectError: If a time is not finite.
-    """
-    if not len(times):
-        return None, 0.0
-    is_whole = times.dtype.kind in "iu"
-    # NaN that signals.
-    with np.errstate(invalid="ignore", over="ignore"):
-        exact = times.astype(np.int64 if is_whole else np.float64)
-        first, end = exact.min(), float(exact.max())
-        since_first = (exact - first).astype(np.float64)
-        took = since_first.max()
-    # From one end of the numbers to the other is farther than any of them is large.
-    if not (np.isfinite(first) and np.isfinite(end) and np.isfinite(took)) or took < 0.0:
-        raise DefectError(Defect.BAD_GEOMETRY)
-    end_s = end / NANOSECONDS if is_whole or abs(end) > _LARGEST_S else end
-    late_s = end_s - stamp_s if end_s > _SINCE_EPOCH_S else end_s
-    point_times = since_first / took if took > 0.0 else None
-    return point_times, late_s if abs(late_s) <= _LONGEST_SWEEP_S else 0.0
 
 
 def _checked_frame(header: Header, allowed: Collection[str] | None) -> str:

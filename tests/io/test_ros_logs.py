@@ -37,8 +37,8 @@ ROS1, ROS2 = Ros(Serialization.ROS1), Ros(Serialization.CDR)
 BODY_FROM_SENSOR = planar_pose(0.3, -0.1, 0.7)
 
 
-def read(path: Path, **options: Pose) -> Log:
-    return read_log(path, min_range_m=0.0, max_range_m=100.0, **options)
+def read(path: Path, body_from_sensor: Pose | None = None) -> Log:
+    return read_log(path, min_range_m=0.0, max_range_m=100.0, body_from_sensor=body_from_sensor)
 
 
 def write_mcap(path: Path, messages: list[Stamped], ros: Ros) -> Path:
