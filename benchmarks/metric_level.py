@@ -27,7 +27,7 @@ import numpy as np
 from benchmarks import honesty
 from benchmarks.cells import Result
 from benchmarks.chain import write_readings
-from benchmarks.kitti import read_kitti
+from benchmarks.kitti import read_truth
 from benchmarks.metric import Direction, Metric
 from benchmarks.recordings import Missing, first_scans, read_recorded, recorded_file
 from benchmarks.relative_motion import motion_errors
@@ -157,12 +157,8 @@ def _simulated(drive: _Drive, path: Path) -> tuple[StampedPose, ...]:
 
 
 def _kitti(folder: Path, path: Path) -> tuple[StampedPose, ...]:
-    sensor = load_config(Preset.OUTDOOR).sensor
-    scans, truth = read_kitti(
-        folder, min_range_m=sensor.min_range_m, max_range_m=sensor.max_range_m
-    )
-    write_readings(scans, path)
-    return truth
+    write_readings(read_recorded(folder, load_config(Preset.OUTDOOR)), path)
+    return read_truth(folder)
 
 
 def _compare(preset: Preset, source: Source, *, has_odometry: bool = True) -> Result:

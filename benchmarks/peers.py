@@ -31,7 +31,7 @@ from benchmarks.kiss_slam import (
     make_environment,
     run_kiss_slam,
 )
-from benchmarks.kitti import read_kitti
+from benchmarks.kitti import read_truth
 from benchmarks.metric import Direction, Metric
 from benchmarks.processes import ChildFailed
 from benchmarks.recordings import Missing, read_recorded, recorded_file
@@ -121,12 +121,8 @@ def _simulated(family: Family, seed: int, scans: int | None, path: Path) -> tupl
 
 
 def _kitti(poses: Path, path: Path) -> tuple[StampedPose, ...]:
-    sensor = load_config(Preset.OUTDOOR).sensor
-    scans, truth = read_kitti(
-        poses.parent, min_range_m=sensor.min_range_m, max_range_m=sensor.max_range_m
-    )
-    write_readings(scans, path)
-    return truth
+    write_readings(read_recorded(poses.parent, load_config(Preset.OUTDOOR)), path)
+    return read_truth(poses.parent)
 
 
 def _recorded(log: Path, path: Path) -> tuple[StampedPose, ...]:

@@ -10,7 +10,18 @@ from typing import Annotated
 import typer
 
 from hmt_service import __version__
-from hmt_service.cli import control, demo, evaluate, map_files, query, replay, run, serve, sim
+from hmt_service.cli import (
+    control,
+    demo,
+    evaluate,
+    inspect,
+    map_files,
+    query,
+    replay,
+    run,
+    serve,
+    sim,
+)
 
 app = typer.Typer(
     name="hmt",
@@ -41,6 +52,7 @@ def _options(
 
 app.command("demo")(demo.demo)
 app.command("run")(run.run)
+app.command("inspect")(inspect.inspect)
 app.command("sim")(sim.sim)
 app.command("serve")(serve.serve)
 app.command("replay")(replay.replay)

@@ -5,13 +5,22 @@ References: own.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
 
 if TYPE_CHECKING:
     from rich.console import Console
 
     from hmt_service.io.logs import Log
 
+LogPath = Annotated[
+    Path,
+    typer.Argument(
+        help="Recorded log: CARMEN, MCAP, bag of ROS, or folder of scans (KITTI, PCD, PLY)."
+    ),
+]
 _SHOWN = 5
 """Malformed places that are printed with their reason."""
 
@@ -19,6 +28,8 @@ _SHOWN = 5
 def print_contents(console: Console, log: Log) -> None:
     """Print what a log holds."""
     console.print(f"{log.scans} scans, {log.odometry} odometry readings")
+    for note in log.notes:
+        console.print(f"{note.what}: {note.step}", soft_wrap=True, markup=False)
     if log.unread:
         console.print(f"not read: {', '.join(log.unread)}", soft_wrap=True, markup=False)
 

@@ -9,14 +9,13 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from hmt_service.cli.connection import Connect, Robot, Site, ZenohConfig, connected
-from hmt_service.cli.recorded import print_contents, print_malformed
-from hmt_service.cli.settings import SensorPose, pose_on_body
+from hmt_service.cli.recorded import LogPath, print_contents, print_malformed
+from hmt_service.cli.settings import ScanRate, SensorPose, pose_on_body
 from hmt_service.errors import DaemonFailure
 
 if TYPE_CHECKING:
@@ -32,7 +31,7 @@ _POLL_S = 0.1
 
 
 def replay(
-    log: Annotated[Path, typer.Argument(help="Recorded log: CARMEN, MCAP or ROS.")],
+    log: LogPath,
     connect: Connect = None,
     site: Site = "site",
     robot: Robot = "robot",
@@ -42,6 +41,7 @@ def replay(
         typer.Option(min=1e-3, help="Speed in multiples of real time; without it, full speed."),
     ] = None,
     sensor_pose: SensorPose = None,
+    scan_rate: ScanRate = None,
     finish: Annotated[
         bool, typer.Option(help="Wait until all is in the map, and have it completed and saved.")
     ] = True,
@@ -60,6 +60,7 @@ def replay(
                 min_range_m=0.0,
                 max_range_m=_FARTHEST_M,
                 body_from_sensor=pose_on_body(sensor_pose),
+                scan_rate_hz=scan_rate,
             )
         print_contents(console, recorded)
         replay_readings(

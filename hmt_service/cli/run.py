@@ -5,17 +5,20 @@ References: own.
 
 from __future__ import annotations
 
+import math
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hmt_service.cli.recorded import print_contents, print_malformed
+from hmt_service.cli.recorded import LogPath, print_contents, print_malformed
 from hmt_service.cli.settings import (
     BudgetSize,
     ConfigFile,
     Frozen,
-    OwnPreset,
+    MeasuredPreset,
+    ScanRate,
     Seed,
     SensorPose,
     budget_of,
@@ -29,19 +32,21 @@ if TYPE_CHECKING:
 
     from rich.console import Console
 
-    from hmt_service.core.config import Config
+    from hmt_service.core.config import Config, Preset
     from hmt_service.core.engine import Engine
     from hmt_service.core.types import Event, Reading
+    from hmt_service.io.logs import Log
     from hmt_service.runtime.messages import RunReport
 
 
 def run(
-    log: Annotated[Path, typer.Argument(help="Recorded log: CARMEN, MCAP or ROS.")],
+    log: LogPath,
     out: Annotated[Path, typer.Option(help="Folder to write trajectory, map and summary to.")],
-    preset: OwnPreset = None,
+    preset: MeasuredPreset = None,
     config: ConfigFile = None,
     seed: Seed = 0,
     sensor_pose: SensorPose = None,
+    scan_rate: ScanRate = None,
     map_file: Annotated[
         Path | None,
         typer.Option(
@@ -60,14 +65,16 @@ def run(
 
     console = Console(stderr=True)
     kept = kept_map(map_file, is_frozen=frozen, is_known=True)
-    settings = settings_of_map(map_file, preset, config)
     budget = budget_of(memory_budget)
+    read = partial(
+        read_log, log, body_from_sensor=pose_on_body(sensor_pose), scan_rate_hz=scan_rate
+    )
     with console.status(f"reading {log}"):
-        recorded = read_log(
-            log,
-            min_range_m=settings.sensor.min_range_m,
-            max_range_m=settings.sensor.max_range_m,
-            body_from_sensor=pose_on_body(sensor_pose),
+        if preset is None and map_file is None:
+            preset = _measured_preset(console, read(min_range_m=0.0, max_range_m=math.inf))
+        settings = settings_of_map(map_file, preset, config)
+        recorded = read(
+            min_range_m=settings.sensor.min_range_m, max_range_m=settings.sensor.max_range_m
         )
     print_contents(console, recorded)
     begin = Engine if kept is None else kept.engine
@@ -77,6 +84,17 @@ def run(
     files = save_results(engine, report, directory=out, config=settings, seed=seed)
     _report_map(console, engine, report)
     console.print(f"saved {', '.join(files)} in {out}", soft_wrap=True)
+
+
+def _measured_preset(console: Console, recorded: Log) -> Preset | None:
+    """Return the preset for what the sensor sees, and say why; None if it sees nothing."""
+    from hmt_service.io.inspection import choose_preset
+
+    fit = choose_preset(recorded)
+    if fit is None:
+        return None
+    console.print(str(fit), soft_wrap=True, markup=False, highlight=False)
+    return fit.preset
 
 
 def _map(

@@ -24,6 +24,12 @@ OwnPreset = Annotated[
     Preset | None,
     typer.Option("--preset", help=f"Kind of sensor; {Preset.PLANAR} if none is given."),
 ]
+MeasuredPreset = Annotated[
+    Preset | None,
+    typer.Option(
+        "--preset", help="Kind of sensor; if none is given, the one that fits what the log sees."
+    ),
+]
 ConfigFile = Annotated[
     Path | None,
     typer.Option("--config", help="YAML file of settings that differ from the preset."),
@@ -52,8 +58,18 @@ SensorPose = Annotated[
     typer.Option(
         "--sensor-pose",
         metavar="X Y Z ROLL PITCH YAW",
-        help="Pose of the sensor on the body, m and degrees, for scans of ROS. Without it a log's "
-        "`tf_static` says it; where nothing does, only odometry of the scans' own frame is taken.",
+        help="Pose of the sensor on the body, m and degrees, for scans of ROS and in folders. "
+        "Without it a log's `tf_static` says it; where nothing does, only odometry of the scans' "
+        "own frame is taken.",
+    ),
+]
+ScanRate = Annotated[
+    float | None,
+    typer.Option(
+        "--scan-rate",
+        min=1e-3,
+        metavar="HZ",
+        help="Scans per second of a folder of scans that have no stamps; 10 if none is given.",
     ),
 ]
 _UNITS = {"KB": 1e3, "MB": 1e6, "GB": 1e9}

@@ -29,7 +29,7 @@ def table_of(title: str, headings: Iterable[str], rows: Iterable[Iterable[object
 
     table = Table(title=title, title_justify="left", show_header=any(headings))
     for heading in headings:
-        table.add_column(heading)
+        table.add_column(heading, overflow="fold")
     for row in rows:
         table.add_row(*map(str, row))
     return table

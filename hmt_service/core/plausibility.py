@@ -9,7 +9,7 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from enum import Enum, auto
 
@@ -17,7 +17,7 @@ import numpy as np
 
 from hmt_service.core.config import Preset, SensorConfig, load_config
 from hmt_service.core.geometry import FloatArray
-from hmt_service.core.types import Event, EventKind, Keyframe
+from hmt_service.core.types import Event, EventKind, Keyframe, Scan
 
 _FIRST_LOOK = 40
 """Keyframes before the first verdict: many a drive starts in a corner (measured: one in the open
@@ -34,20 +34,74 @@ class _Contradiction(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class _Seen:
-    """Quantiles over all keyframes so far; upper edges of their bins."""
+class Seen:
+    """Quantiles over what was looked at; upper edges of their bins."""
 
-    keyframes: int
     median_range_m: float
+    """Half of what is seen is nearer."""
     range_95_m: float
+    """95 % is nearer."""
     height_95_m: float
+    """95 % is within this distance of one plane through the sensor."""
 
     def __str__(self) -> str:
+        """Return the numbers as a sentence."""
         return (
-            f"in {self.keyframes} keyframes, half of what it sees is nearer than "
-            f"{self.median_range_m:.1f} m, 95 % nearer than {self.range_95_m:.1f} m, and 95 % "
-            f"within {self.height_95_m:.1f} m of one plane through the sensor"
+            f"half of what it sees is nearer than {self.median_range_m:.1f} m, 95 % nearer than "
+            f"{self.range_95_m:.1f} m, and 95 % within {self.height_95_m:.1f} m of one plane "
+            "through the sensor"
         )
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """Which preset is for what a sensor sees, and why."""
+
+    preset: Preset
+    """The preset."""
+    has_doubt: bool
+    """Whether what is seen contradicts even this preset, the least wrong one."""
+    scans: int
+    """How many scans with returns this was measured in."""
+    seen: Seen
+    """What they see."""
+
+    def __str__(self) -> str:
+        """Return the choice and its numbers as a sentence."""
+        verdict = "least wrong, though no preset fits" if self.has_doubt else "fits"
+        return f"preset {self.preset} {verdict}: in {self.scans} scans, {self.seen}"
+
+
+def fitting_preset(scans: Iterable[Scan]) -> Fit | None:
+    """Return the preset that fits what a sensor sees best, by the expectations of the presets.
+
+    Args:
+        scans: Some of a drive, from all of it.
+
+    Returns:
+        The choice; None if there is no return in any of them.
+    """
+    sensors = {preset: load_config(preset).sensor for preset in Preset}
+    nearest_m = min(sensor.min_range_m for sensor in sensors.values())
+    farthest_m = max(sensor.max_range_m for sensor in sensors.values())
+    view = _View(farthest_m)
+    looked_at = 0
+    for scan in scans:
+        rays = scan.points_in_body - scan.sensor_in_body
+        ranges = np.linalg.norm(rays, axis=1)
+        looked_at += view.learn(rays[(ranges >= nearest_m) & (ranges <= farthest_m)])
+    if not looked_at:
+        return None
+    seen = view.seen()
+    wrong = {preset: _contradictions(seen, sensor) for preset, sensor in sensors.items()}
+    # What is no plane must not be mapped as one, and nothing else as it.
+    possible = [
+        preset
+        for preset in Preset
+        if not {_Contradiction.FLAT, _Contradiction.NOT_FLAT} & set(wrong[preset])
+    ]
+    best = max(possible, key=lambda preset: _margin_m(seen, sensors[preset]))
+    return Fit(best, bool(wrong[best]), looked_at, seen)
 
 
 class Plausibility:
@@ -60,8 +114,7 @@ class Plausibility:
             sensor: What is expected.
         """
         self._sensor = sensor
-        self._ranges = _Histogram(sensor.max_range_m)
-        self._heights = _Histogram(sensor.max_range_m)
+        self._view = _View(sensor.max_range_m)
         self._keyframes = 0
         self._next_look = _FIRST_LOOK
         self._said: tuple[Preset, ...] | None = None
@@ -74,11 +127,8 @@ class Plausibility:
 
     def check(self, keyframe: Keyframe) -> tuple[Event, ...]:
         """Look at one more keyframe, and return an event when the verdict has changed."""
-        rays = _one_per_cell(keyframe.points_in_body - keyframe.sensor_in_body)
-        if not len(rays):
+        if not self._view.learn(keyframe.points_in_body - keyframe.sensor_in_body):
             return ()
-        self._ranges.learn(np.linalg.norm(rays, axis=1))
-        self._heights.learn(_heights(rays))
         self._keyframes += 1
         if self._keyframes < self._next_look:
             return ()
@@ -86,28 +136,46 @@ class Plausibility:
         return self._judge(keyframe.stamp_s)
 
     def _judge(self, stamp_s: float) -> tuple[Event, ...]:
-        seen = _Seen(
-            self._keyframes,
-            self._ranges.quantile(0.5),
-            self._ranges.quantile(0.95),
-            self._heights.quantile(0.95),
-        )
+        seen = self._view.seen()
         found = _contradictions(seen, self._sensor)
         verdict = _fitting(seen) if found else None
         if verdict == self._said:
             return ()
         self._said = verdict
-        numbers = {**asdict(seen), **_expected(self._sensor)}
+        numbers = {"keyframes": self._keyframes, **asdict(seen), **_expected(self._sensor)}
+        what = f"in {self._keyframes} keyframes, {seen}"
         name = _name(self._sensor)
         if verdict is None:
             self._doubt = None
-            message = f"{name} fits after all: {seen}"
+            message = f"{name} fits after all: {what}"
             return (Event(EventKind.PRESET_CONFIRMED, stamp_s, message, numbers),)
         expectations = " and ".join(_expectation(each, self._sensor) for each in found)
         advice = f"{' or '.join(verdict)} would fit better" if verdict else "no preset fits"
-        message = f"{name} expects {expectations}; {seen}: {advice}"
+        message = f"{name} expects {expectations}; {what}: {advice}"
         self._doubt = Event(EventKind.PRESET_DOUBTED, stamp_s, message, numbers)
         return (self._doubt,)
+
+
+class _View:
+    """What was seen so far, every cell of space once per look."""
+
+    def __init__(self, max_range_m: float) -> None:
+        self._ranges = _Histogram(max_range_m)
+        self._heights = _Histogram(max_range_m)
+
+    def learn(self, rays: FloatArray) -> bool:
+        """Look at the returns of one scan, shape (N, 3); return whether there were any."""
+        once = _one_per_cell(rays)
+        if not len(once):
+            return False
+        self._ranges.learn(np.linalg.norm(once, axis=1))
+        self._heights.learn(_heights(once))
+        return True
+
+    def seen(self) -> Seen:
+        return Seen(
+            self._ranges.quantile(0.5), self._ranges.quantile(0.95), self._heights.quantile(0.95)
+        )
 
 
 class _Histogram:
@@ -142,7 +210,15 @@ def _heights(rays: FloatArray) -> FloatArray:
     return np.asarray(np.abs(rays @ axes[:, 0]))
 
 
-def _contradictions(seen: _Seen, sensor: SensorConfig) -> tuple[_Contradiction, ...]:
+def _margin_m(seen: Seen, sensor: SensorConfig) -> float:
+    """Return how far the median range is from what would contradict; negative if it does."""
+    return min(
+        seen.median_range_m - sensor.min_median_range_m,
+        sensor.max_median_range_m - seen.median_range_m,
+    )
+
+
+def _contradictions(seen: Seen, sensor: SensorConfig) -> tuple[_Contradiction, ...]:
     is_flat = seen.height_95_m <= sensor.flat_height_m
     holds = {
         _Contradiction.TOO_NEAR: seen.median_range_m < sensor.min_median_range_m,
@@ -165,7 +241,7 @@ def _expectation(contradiction: _Contradiction, sensor: SensorConfig) -> str:
             return f"a median range of at most {sensor.max_median_range_m:g} m"
 
 
-def _fitting(seen: _Seen) -> tuple[Preset, ...]:
+def _fitting(seen: Seen) -> tuple[Preset, ...]:
     return tuple(p for p in Preset if not _contradictions(seen, load_config(p).sensor))
 
 

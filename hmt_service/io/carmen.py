@@ -44,12 +44,18 @@ from hmt_service.core.geometry import (
 from hmt_service.core.types import OdometryReading, Reading, Scan
 from hmt_service.errors import InvalidLog
 from hmt_service.io.malformed import Malformed, Tally
-from hmt_service.io.streams import IN_EVERY_SCAN, Arrival, Mounting, Stream, Use
+from hmt_service.io.streams import IN_EVERY_SCAN, Arrival, Mounting, Note, Stream, Use
 
 _WORDS_IN_CONFIG = 7
 _WORDS_IN_TIME = 3
 _WORDS_BETWEEN_POSES_AND_TIME = 5
 _RAW_SCAN = b"RAWLASER1"
+_KINDS = {
+    b"FLASER": "scan, pose",
+    b"ODOM": "pose",
+    b"RAWLASER1": "scan",
+    b"ROBOTLASER1": "scan, pose",
+}
 _TAG = re.compile(rb"[A-Z][A-Z0-9_]*")
 _GZIP_MAGIC = b"\x1f\x8b"
 _BZIP2_MAGIC = b"BZh"
@@ -73,8 +79,10 @@ class CarmenLog:
     """The readings in the order of the file."""
     unread: tuple[str, ...] = ()
     """Empty: all readings are read."""
-    notes: tuple[str, ...] = ()
+    notes: tuple[Note, ...] = ()
     """Empty: nothing is assumed."""
+    reorder_s: float = math.inf
+    """All readings are sorted."""
     mounting: Mounting = IN_EVERY_SCAN
     """Which frames there are: the format names none."""
 
@@ -179,7 +187,12 @@ def carmen_streams(path: Path) -> tuple[Stream, ...]:
     has_others = bool(counts.keys() & {b"FLASER", b"ROBOTLASER1"})
     return tuple(
         Stream(
-            tag.decode(), "message", "text", *_use(tag, has_others), count, np.array(times_s[tag])
+            tag.decode(),
+            _KINDS.get(tag, ""),
+            "text",
+            *_use(tag, has_others),
+            count,
+            np.array(times_s[tag]),
         )
         for tag, count in sorted(counts.items())
     )
@@ -188,11 +201,13 @@ def carmen_streams(path: Path) -> tuple[Stream, ...]:
 def _use(tag: bytes, has_scans: bool) -> tuple[Use, str]:
     """Return what messages are read for, and why, where there are others with scans or not."""
     if tag == _RAW_SCAN:
-        return (Use.NOTHING, "there are other scans") if has_scans else (Use.SCANS, "no other scan")
+        return (
+            (Use.NOTHING, "there are other scans") if has_scans else (Use.SCANS, "no other scans")
+        )
     if tag == b"ODOM":
-        return Use.ODOMETRY, "says where the robot is"
+        return Use.ODOMETRY, ""
     if tag in _PARSERS:
-        return Use.SCANS_AND_ODOMETRY, "every message says where the robot is"
+        return Use.SCANS_AND_ODOMETRY, ""
     return Use.NOTHING, ""
 
 

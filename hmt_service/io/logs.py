@@ -19,7 +19,7 @@ from hmt_service.io.mcap_file import McapFile
 from hmt_service.io.ros_bag import RosBag
 from hmt_service.io.scan_files import SUFFIXES
 from hmt_service.io.scan_folder import ScanFolder, is_scan_folder
-from hmt_service.io.streams import Arrival, Mounting, Stream
+from hmt_service.io.streams import Arrival, Mounting, Note, Stream
 from hmt_service.io.topic_log import TopicFile, read_topics, streams_of
 
 
@@ -47,12 +47,16 @@ class Log(Protocol):
         """What else in the log could have been read."""
 
     @property
-    def notes(self) -> tuple[str, ...]:
-        """What is assumed because the log does not say it, and how to say it."""
+    def notes(self) -> tuple[Note, ...]:
+        """What is assumed because the log does not say it."""
 
     @property
     def mounting(self) -> Mounting:
         """Which frames are read, and who says where the sensor sits."""
+
+    @property
+    def reorder_s(self) -> float:
+        """How much earlier than one before it a reading may be, s, and still be read."""
 
     def arrivals(self, tally: Tally) -> Iterator[Arrival]:
         """Yield the readings as they stand in the log, and count what is none."""

@@ -31,7 +31,7 @@ from hmt_service.errors import InvalidInput, InvalidLog
 from hmt_service.io.decoding import NANOSECONDS, Defect, DefectError, Returns, cloud_scan
 from hmt_service.io.malformed import Malformed, Tally
 from hmt_service.io.scan_files import SUFFIXES, read_scan_file
-from hmt_service.io.streams import Arrival, Mounting, Says, Stream, Use
+from hmt_service.io.streams import Arrival, Mounting, Note, Says, Stream, Use
 
 _STAMP_FILES = ("times.txt", "timestamps.txt")
 _NESTED = Path("velodyne_points", "data")
@@ -63,15 +63,17 @@ class ScanFolder:
         self._suffix = files[0].suffix.lower()
         self._pattern = f"{folder.relative_to(path) / '*'}{self._suffix}"
         stamps_s, self._stamped_by = _stamps(folder, path, files)
-        self.notes: tuple[str, ...] = ()
+        self.notes: tuple[Note, ...] = ()
         if stamps_s is None:
             rate_hz = scan_rate_hz or _USUAL_RATE_HZ
             stamps_s = [number / rate_hz for number in range(len(files))]
             self._stamped_by = f"{rate_hz:g} scans per second"
             if scan_rate_hz is None:
                 self.notes = (
-                    f"no scan has a stamp: assumed {rate_hz:g} scans per second; say --scan-rate, "
-                    f"or put a file {_STAMP_FILES[0]} of one stamp per scan beside them",
+                    Note(
+                        f"no scan has a stamp: {rate_hz:g} scans per second are assumed",
+                        f"say --scan-rate, or put {_STAMP_FILES[0]}, a stamp per line, beside them",
+                    ),
                 )
         elif scan_rate_hz is not None:
             raise InvalidInput(
@@ -149,7 +151,7 @@ class FolderLog:
     """Pose of the sensor, shape (4, 4)."""
     unread: tuple[str, ...]
     """Scans in other formats, with their number."""
-    notes: tuple[str, ...]
+    notes: tuple[Note, ...]
     """What is assumed, because nothing says it."""
     mounting: Mounting
     """Who says where the sensor sits: files name no frames."""
@@ -157,6 +159,8 @@ class FolderLog:
     """What the last complete iteration has left out; nothing before the first."""
     odometry: int = 0
     """There is none."""
+    reorder_s: float = math.inf
+    """All readings are sorted."""
 
     @property
     def scans(self) -> int:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import StrEnum
+from typing import NamedTuple
 
 import numpy as np
 
@@ -37,7 +38,7 @@ class Stream:
     use: Use
     """What it is read for."""
     why: str
-    """Why for that, or for nothing."""
+    """Why for that, or for nothing; empty where nothing else could be."""
     messages: int
     """How many there are."""
     times_s: FloatArray = field(default_factory=lambda: np.zeros(0))
@@ -47,11 +48,14 @@ class Stream:
 class Says(StrEnum):
     """Who says where the sensor sits on the body."""
 
-    EVERY_SCAN = "every scan"
+    EVERY_SCAN = "every_scan"
     STATIC_FRAMES = "tf_static"
-    CALLER = "the caller"
-    SAME_FRAME = "their common frame"
-    NOBODY = "nobody: taken to be the centre of the body"
+    CALLER = "caller"
+    """Whoever reads the log."""
+    SAME_FRAME = "same_frame"
+    """Scans are in the frame of the body."""
+    NOBODY = "nobody"
+    """It is taken to be the centre of the body."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +68,15 @@ class Mounting:
     """Frame that the odometry is of; None where the format names none."""
     says: Says
     """Who says it."""
+
+
+class Note(NamedTuple):
+    """Something that is assumed because a log does not say it."""
+
+    what: str
+    """What."""
+    step: str
+    """How to say it."""
 
 
 IN_EVERY_SCAN = Mounting(None, None, Says.EVERY_SCAN)

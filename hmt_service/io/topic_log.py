@@ -33,7 +33,7 @@ from hmt_service.io.decoding import NANOSECONDS, Decoded, Defect, names_of_body
 from hmt_service.io.malformed import Malformed, Tally
 from hmt_service.io.ros_frames import StaticFrames
 from hmt_service.io.ros_messages import SCAN_TYPES, TRANSFORMS, Frames, RosType, Serialization
-from hmt_service.io.streams import Arrival, Mounting, Says, Stream, Use
+from hmt_service.io.streams import Arrival, Mounting, Note, Says, Stream, Use
 
 PROTOBUF = "protobuf"
 """Encoding of the messages of foxglove; those of ROS are `Serialization`."""
@@ -46,7 +46,7 @@ _BODIES = ("base_link", "base_footprint")
 """Bodies to look for where no odometry names one."""
 _STATIC_FRAMES = "tf_static"
 
-_REORDER_S = 1.0
+REORDER_S = 1.0
 """How much earlier than the latest stamp a reading may be: a slow driver's delay."""
 
 
@@ -170,7 +170,7 @@ class _Readings(Iterable[Reading]):
 
     def __iter__(self) -> Iterator[Reading]:
         """Yield the readings in the order of time; at equal stamps odometry comes first."""
-        tally, window = Tally(), ReorderWindow(_REORDER_S)
+        tally, window = Tally(), ReorderWindow(REORDER_S)
         for arrival in self.arrivals(tally):
             released = window.push(arrival.reading)
             if released is None:
@@ -198,8 +198,10 @@ class TopicLog:
     """Other topics of scans or odometry, with the number of their messages."""
     mounting: Mounting
     """Which frames are read, and who says where the sensor sits."""
-    notes: tuple[str, ...] = ()
+    notes: tuple[Note, ...] = ()
     """Empty: nothing is assumed that `mounting` does not say."""
+    reorder_s: float = REORDER_S
+    """How much earlier than one before it a reading may be."""
 
     @property
     def malformed(self) -> tuple[Malformed, ...]:
@@ -269,13 +271,13 @@ def streams_of(file: TopicFile) -> tuple[Stream, ...]:
     times_s: defaultdict[Topic, array[float]] = defaultdict(lambda: array("d"))
     for topic, time_ns in file.times():
         times_s[topic].append(time_ns / NANOSECONDS)
-    chosen = _chosen(Counter({t: count for t, count in counts.items() if _is_known(t)}))
+    known = Counter({topic: count for topic, count in counts.items() if _is_known(topic)})
     return tuple(
         Stream(
             topic.name,
             topic.schema,
             topic.encoding,
-            *_use(topic, *chosen),
+            *_use(topic, known),
             counts[topic],
             np.array(times_s[topic]),
         )
@@ -283,12 +285,13 @@ def streams_of(file: TopicFile) -> tuple[Stream, ...]:
     )
 
 
-def _use(topic: Topic, scan: Topic | None, odometry: Topic | None) -> tuple[Use, str]:
-    """Return what a topic is read for, and why."""
+def _use(topic: Topic, counts: Counter[Topic]) -> tuple[Use, str]:
+    """Return what one of these topics is read for, and why."""
+    scan, odometry = _chosen(counts)
     if topic == scan:
-        return Use.SCANS, "most messages of all topics of scans"
+        return Use.SCANS, _reason(topic, counts, _SCANS)
     if topic == odometry:
-        return Use.ODOMETRY, "most messages of all topics of odometry"
+        return Use.ODOMETRY, _reason(topic, counts, _ODOMETRY)
     if not _is_known(topic):
         is_wanted = topic.schema in _SCANS | _ODOMETRY
         return Use.NOTHING, f"encoding {topic.encoding} is not read" if is_wanted else ""
@@ -301,6 +304,15 @@ def _use(topic: Topic, scan: Topic | None, odometry: Topic | None) -> tuple[Use,
     if _is_static(topic):
         return Use.FRAMES, "where the sensor may sit"
     return Use.NOTHING, ""
+
+
+def _reason(topic: Topic, counts: Counter[Topic], schemas: Collection[str]) -> str:
+    """Return why a topic was chosen among those of some schemas."""
+    of_kind = [each for each in counts if each.schema in schemas]
+    if len(of_kind) == 1:
+        return "no other"
+    has_most = all(counts[topic] >= counts[each] for each in of_kind)
+    return "most messages" if has_most else "says which body it is of"
 
 
 def _chosen(counts: Counter[Topic]) -> tuple[Topic | None, Topic | None]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import numpy as np
 from hmt_service.core.config import Preset, load_config
 from hmt_service.core.types import Reading, Scan, StampedPose
 from hmt_service.io.carmen import read_carmen
+from hmt_service.io.logs import read_log
 from hmt_service.io.relations import evaluate, read_relations
 from hmt_service.io.trajectory import write_tum
 from hmt_service.runtime.offline import map_readings
@@ -53,13 +55,9 @@ def test_lidar_without_odometry_is_tracked_to_a_few_per_cent(hmt_data: Path) -> 
     folder = hmt_data / "3d/kitti00-part"
     truth = np.loadtxt(folder / "poses.txt").reshape(-1, 3, 4)[:40]
     config = load_config(Preset.OUTDOOR)
-    scans = []
-    for number in range(len(truth)):
-        file = folder / f"velodyne/{number:06d}.bin"
-        points = np.fromfile(file, dtype=np.float32).reshape(-1, 4)[:, :3].astype(np.float64)
-        ranges = np.linalg.norm(points, axis=1)
-        is_inside = (ranges > config.sensor.min_range_m) & (ranges < config.sensor.max_range_m)
-        scans.append(Scan(0.2 * number, points[is_inside], np.zeros(3)))
+    sensor = config.sensor
+    log = read_log(folder, min_range_m=sensor.min_range_m, max_range_m=sensor.max_range_m)
+    scans = list(islice(log.readings, len(truth)))
     engine, _ = map_readings(scans, config)
     last = engine.trajectory()[-1].reference_from_body[:3, 3]
     expected = truth[0, :, :3].T @ (truth[-1, :, 3] - truth[0, :, 3])
