@@ -178,8 +178,8 @@ def carmen_streams(path: Path) -> tuple[Stream, ...]:
                     continue
                 counts[words[0]] += 1
                 # Whatever the message, its time is there.
-                with suppress(ValueError):
-                    times_s[words[0]].append(float(words[-_WORDS_IN_TIME]))
+                with suppress(_Malformed):
+                    times_s[words[0]] += array("d", _Words(words[-_WORDS_IN_TIME:]).finite(1))
     except _Malformed:
         pass
     except OSError as error:

@@ -318,10 +318,9 @@ def _backwards(facts: Facts, what: str, timing: Timing) -> Iterator[Finding]:
 
 
 def _gaps(facts: Facts, scans: Timing) -> Finding:
-    stamps_s = np.sort(np.array(facts.odometry_stamps_s))
     begins_s = scans.longest_gap_at_s or 0.0
-    ends_s = begins_s + scans.longest_gap_s
-    is_bridged = bool(((stamps_s >= begins_s) & (stamps_s <= ends_s)).any())
+    ends_s = np.array([begins_s, begins_s + scans.longest_gap_s])
+    is_bridged = _uncovered(ends_s, np.array(facts.odometry_stamps_s)) == 0.0
     is_bad = scans.longest_gap_s > _LONG_GAP_S and not is_bridged
     return Finding(
         Severity.WARNING if is_bad else Severity.NOTE,
@@ -402,9 +401,9 @@ def _clocks(facts: Facts) -> Iterator[Finding]:
         )
 
 
-def _uncovered(scan_stamps_s: FloatArray, odometry_stamps_s: FloatArray) -> float:
-    """Return the share of scans that have no odometry near their stamps."""
+def _uncovered(stamps_s: FloatArray, odometry_stamps_s: FloatArray) -> float:
+    """Return the share of stamps that no odometry is near to."""
     known = np.concatenate([[-np.inf], np.sort(odometry_stamps_s), [np.inf]])
-    after = np.searchsorted(known[1:-1], scan_stamps_s) + 1
-    nearest = np.minimum(known[after] - scan_stamps_s, scan_stamps_s - known[after - 1])
+    after = np.searchsorted(known[1:-1], stamps_s) + 1
+    nearest = np.minimum(known[after] - stamps_s, stamps_s - known[after - 1])
     return float(np.mean(nearest > _COVERED_S))

@@ -23,6 +23,8 @@ _USUAL_PERIODS = 5.0
 """A gap is longer than both: half a second, and so many usual periods."""
 _STEP_DEG = 0.05
 """Resolution of the directions that are counted."""
+_LIDAR_STEP_DEG = 2.0
+"""Columns of a LiDAR are nearer to each other than this."""
 _ALIKE_M = 1e-3
 """Ranges nearer to each other than this are one number."""
 _CLEAR_SHARE = 0.95
@@ -220,7 +222,7 @@ class ScanCollector:
         """Return what the scans are like, of a planar laser or not."""
         points = np.array(self._points)
         step_deg = float(np.degrees(np.median(self._steps_rad))) if self._steps_rad else 0.0
-        width_deg = _width_deg(self._azimuths, step_deg if is_planar else 1.0)
+        width_deg = _width_deg(self._azimuths, step_deg if is_planar else _LIDAR_STEP_DEG)
         beams = None
         if is_planar and step_deg > 0.0:
             beams = round(width_deg / step_deg) + (width_deg < 360.0)
@@ -287,8 +289,8 @@ class OdometryCollector:
 
 
 def _path_m(times_s: FloatArray, positions: FloatArray) -> float:
-    seconds = np.arange(times_s[0], times_s[-1], _PATH_STEP_S)
-    at = np.append(np.searchsorted(times_s, seconds), len(times_s) - 1)
+    _, first = np.unique(np.floor(times_s / _PATH_STEP_S), return_index=True)
+    at = np.append(first, len(times_s) - 1)
     return float(np.linalg.norm(np.diff(positions[at], axis=0), axis=1).sum())
 
 

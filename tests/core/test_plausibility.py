@@ -8,8 +8,8 @@ import pytest
 from hmt_service.core.config import Preset, load_config
 from hmt_service.core.engine import Engine
 from hmt_service.core.geometry import FloatArray, certain, exp, identity
-from hmt_service.core.plausibility import Plausibility
-from hmt_service.core.types import Event, EventKind, Keyframe, Tracking
+from hmt_service.core.plausibility import Plausibility, fitting_preset
+from hmt_service.core.types import Event, EventKind, Keyframe, Scan, Tracking
 
 SENSOR = np.array([0.3, -0.2, 0.8])
 UPRIGHT = np.eye(3)
@@ -201,3 +201,49 @@ def test_the_engine_returns_the_event_and_keeps_the_warning() -> None:
         assert (len(engine.warnings) == 1) is (index >= 39)
     doubts = [event for event in events if event.kind is EventKind.PRESET_DOUBTED]
     assert tuple(doubts) == engine.warnings
+
+
+def scans_of(rays: FloatArray, count: int = 50) -> list[Scan]:
+    return [Scan(float(n), rays + SENSOR, SENSOR) for n in range(count)]
+
+
+@pytest.mark.parametrize(
+    ("rays", "preset"),
+    [
+        (SLICE, Preset.PLANAR),
+        (SLICE @ SLANT.T, Preset.PLANAR),
+        (ROOM, Preset.INDOOR),
+        (FIELD, Preset.OUTDOOR),
+        # Both fit where their expectations overlap, from 13 to 16 m: the middle divides them.
+        (rays_of(14.0, 60.0), Preset.INDOOR),
+        (rays_of(15.0, 60.0), Preset.OUTDOOR),
+    ],
+)
+def test_the_preset_that_fits_is_found(rays: FloatArray, preset: Preset) -> None:
+    fit = fitting_preset(scans_of(rays))
+    assert fit is not None
+    assert (fit.preset, fit.has_doubt, fit.scans) == (preset, False, 50)
+    assert str(fit).startswith(f"preset {preset} fits: in 50 scans, half of what it sees")
+
+
+def test_the_preset_that_fits_is_not_doubted_on_the_way() -> None:
+    for rays in (SLICE, ROOM, FIELD):
+        fit = fitting_preset(scans_of(rays))
+        assert fit is not None
+        assert checked(fit.preset, rays) == []
+
+
+def test_what_no_preset_expects_gets_the_least_wrong_one() -> None:
+    fit = fitting_preset(scans_of(rays_of(50.0, 90.0, is_flat=True)))
+    assert fit is not None
+    assert (fit.preset, fit.has_doubt) == (Preset.PLANAR, True)
+    assert "least wrong, though no preset fits" in str(fit)
+
+
+def test_scans_without_a_return_in_sight_tell_no_preset() -> None:
+    nothing = Scan(0.0, np.zeros((0, 3)), SENSOR)
+    assert fitting_preset([nothing]) is None
+    assert fitting_preset(scans_of(1000.0 * ROOM)) is None
+    fit = fitting_preset([nothing, *scans_of(ROOM, 3)])
+    assert fit is not None
+    assert fit.scans == 3

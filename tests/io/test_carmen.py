@@ -16,7 +16,9 @@ from hypothesis import strategies as st
 from hmt_service.core.geometry import planar_pose
 from hmt_service.core.types import OdometryReading, Scan
 from hmt_service.errors import InvalidLog
-from hmt_service.io.carmen import CarmenLog, read_carmen
+from hmt_service.io.carmen import CarmenLog, carmen_streams, read_carmen
+from hmt_service.io.malformed import Tally
+from hmt_service.io.streams import Use
 
 
 def flaser(
@@ -272,3 +274,37 @@ def test_recorded_log_is_read_whole(
     assert {len(scan.points_in_body) for scan in scans_of(log)} == {beams}
     sensors = np.array([scan.sensor_in_body for scan in scans_of(log)])
     assert sensors == pytest.approx(np.tile([mount_m, 0.0, 0.0], (scans, 1)), abs=2e-6)
+
+
+def test_streams_are_the_tags_with_their_times_and_uses(tmp_path: Path) -> None:
+    path = tmp_path / "a.log"
+    raw = "RAWLASER1 0 0 0 0.1 0 0 0 2 1 1 0 1.5 host 0"
+    lines = ["# no message", "PARAM a b nan host 0", flaser([1.0, 2.0]), odom(2.0), odom(3.0), raw]
+    path.write_text("\n".join(lines))
+    streams = {stream.name: stream for stream in carmen_streams(path)}
+    assert {name: (stream.messages, stream.use) for name, stream in streams.items()} == {
+        "FLASER": (1, Use.SCANS_AND_ODOMETRY),
+        "ODOM": (2, Use.ODOMETRY),
+        "PARAM": (1, Use.NOTHING),
+        "RAWLASER1": (1, Use.NOTHING),
+    }
+    assert streams["ODOM"].times_s.tolist() == [2.0, 3.0]
+    assert streams["PARAM"].times_s.tolist() == []
+    path.write_text(raw)
+    (alone,) = carmen_streams(path)
+    assert alone.use is Use.SCANS
+
+
+def test_arrivals_are_in_the_order_of_the_file_and_defects_are_counted(tmp_path: Path) -> None:
+    path = tmp_path / "a.log"
+    path.write_text("\n".join([odom(3.0), "ODOM nonsense", flaser([1.0, 2.0], stamp_s=2.0)]))
+    tally = Tally()
+    log = read_carmen(path, min_range_m=0.0, max_range_m=10.0)
+    arrivals = list(log.arrivals(tally))
+    assert [(a.stream, a.place, a.reading.stamp_s) for a in arrivals] == [
+        ("ODOM", "line 1", 3.0),
+        ("FLASER", "line 3", 2.0),
+        ("FLASER", "line 3", 2.0),
+    ]
+    assert [each.place for each in tally.result()] == ["line 2"]
+    assert [scan.stamp_s for scan in log.sample(100)] == [2.0]

@@ -30,7 +30,8 @@ from hmt_service.errors import InvalidInput, InvalidLog
 from hmt_service.io.decoding import Defect
 from hmt_service.io.mcap_file import McapFile
 from hmt_service.io.mcap_writer import McapWriter
-from hmt_service.io.topic_log import TopicLog, read_topics
+from hmt_service.io.streams import Use
+from hmt_service.io.topic_log import TopicLog, read_topics, streams_of
 from tests.flat import readings
 from tests.messages import cloud, laser_scan, odometry, stamp
 
@@ -441,3 +442,39 @@ def test_a_missing_file_is_refused(tmp_path: Path) -> None:
     path.unlink()
     with pytest.raises(InvalidLog, match="No such file"):
         keys(log)
+
+
+@pytest.mark.parametrize("has_chunks", [True, False])
+@pytest.mark.parametrize("is_complete", [True, False])
+def test_streams_have_the_times_of_all_messages(
+    tmp_path: Path, has_chunks: bool, is_complete: bool
+) -> None:
+    sent: list[Sent] = [("/points", cloud(np.ones((3, 3)), stamp_s=5.0 + s)) for s in range(7)]
+    sent += [("/few", laser_scan([1.0, 2.0], stamp_s=9.0)), ("/odom", odometry(stamp_s=9.0))]
+    path = recorded(
+        tmp_path / "a.mcap", sent, chunk_size=300, has_chunks=has_chunks, is_complete=is_complete
+    )
+    streams = {stream.name: stream for stream in streams_of(McapFile(path))}
+    assert {name: (s.messages, s.use, s.why) for name, s in streams.items()} == {
+        "/few": (1, Use.NOTHING, "no more messages than /points"),
+        "/odom": (1, Use.ODOMETRY, "no other"),
+        "/points": (7, Use.SCANS, "most messages"),
+    }
+    assert sorted(streams["/points"].times_s) == [5.0 + s for s in range(7)]
+
+
+def test_topics_that_are_not_read_are_listed_with_the_reason(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as file:
+        writer = PlainWriter(file)
+        writer.start()
+        schema = writer.register_schema("foxglove.LaserScan", "jsonschema", b"{}")
+        for topic, number in (("/json", schema), ("/none", 0)):
+            channel = writer.register_channel(topic, "json", number)
+            writer.add_message(channel, 10**9, b"{}", 10**9)
+        writer.finish()
+    json_scans, no_schema = streams_of(McapFile(path))
+    assert (json_scans.use, json_scans.why) == (Use.NOTHING, "encoding json is not read")
+    assert (no_schema.name, no_schema.kind, no_schema.messages) == ("/none", "", 1)
+    with pytest.raises(InvalidLog, match="no usable scan in 0 messages"):
+        read(path)
