@@ -10,13 +10,23 @@ from typing import Annotated
 import typer
 
 from hmt_service import __version__
-from hmt_service.cli import control, demo, evaluate, map_files, query, replay, run, serve, sim
+from hmt_service.cli import (
+    control,
+    demo,
+    doctor,
+    evaluate,
+    map_files,
+    query,
+    replay,
+    run,
+    serve,
+    sim,
+)
 
 app = typer.Typer(
     name="hmt",
     help="Hybrid metric-topological SLAM.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
 )
 
@@ -40,6 +50,7 @@ def _options(
 
 
 app.command("demo")(demo.demo)
+app.command("doctor")(doctor.doctor)
 app.command("run")(run.run)
 app.command("sim")(sim.sim)
 app.command("serve")(serve.serve)

@@ -7,12 +7,12 @@ References:
 from __future__ import annotations
 
 import hashlib
-from enum import StrEnum
 from typing import Any
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from hmt_service.core.choices import Preset as Preset
 from hmt_service.errors import InvalidConfig
 
 
@@ -247,17 +247,6 @@ class Config(Section):
     def hash(self) -> str:
         """Return twelve hexadecimal digits that change when any setting does."""
         return hashlib.sha256(self.model_dump_json().encode()).hexdigest()[:12]
-
-
-class Preset(StrEnum):
-    """Settings per kind of sensor."""
-
-    PLANAR = "2d"
-    """Planar laser."""
-    INDOOR = "3d-indoor"
-    """LiDAR in buildings and garages."""
-    OUTDOOR = "3d-outdoor"
-    """LiDAR on roads, between buildings, in the open."""
 
 
 # Of what so many planes say, more of the error is the map's own. Fitted in simulated worlds.

@@ -269,6 +269,7 @@ class Gateway:
             stored_keyframes=self._report.stored_keyframes,
             localization=snapshot.localization if snapshot else None,
             senders=self._senders.counts(),
+            clock_s=time.time(),
         )
 
     def on_tracking(self, tracking: Tracking) -> None:
