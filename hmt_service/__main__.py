@@ -19,6 +19,7 @@ from hmt_service.errors import (
     InvalidLog,
     Unauthenticated,
     Unavailable,
+    Unreachable,
 )
 
 _NEXT: dict[type[HmtError], str] = {
@@ -29,6 +30,7 @@ _NEXT: dict[type[HmtError], str] = {
     InvalidLog: "docs/troubleshooting.md, under logs",
     Unauthenticated: "README, Security: certificates or passwords, or --allow-unauthenticated",
     Unavailable: "`hmt doctor` looks at this machine and at the daemon",
+    Unreachable: "without internet, have the file on another server: --mirror URL of its folder",
 }
 """What to do after each kind of error; a kind that is not here is told all in its message."""
 

@@ -12,6 +12,7 @@ import typer
 from hmt_service import __version__
 from hmt_service.cli import (
     control,
+    datasets,
     demo,
     doctor,
     evaluate,
@@ -64,6 +65,7 @@ app.command("areas")(query.areas)
 app.command("map")(query.map_)
 app.command("compare")(query.compare)
 app.add_typer(control.app, name="ctl")
+app.add_typer(datasets.app, name="datasets")
 app.command("eval")(evaluate.evaluate)
 app.command("info")(map_files.info)
 app.command("check")(map_files.check)
