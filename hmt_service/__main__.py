@@ -29,7 +29,7 @@ _NEXT: dict[type[HmtError], str] = {
     InvalidConfig: "docs/configuration.md lists every setting with its range",
     InvalidLog: "docs/troubleshooting.md, under logs",
     Unauthenticated: "README, Security: certificates or passwords, or --allow-unauthenticated",
-    Unavailable: "`hmt doctor` looks at this machine and at the daemon",
+    Unavailable: "`hmt status` tells what a daemon has got, `hmt doctor` whether there is one",
     Unreachable: "without internet, have the file on another server: --mirror URL of its folder",
 }
 """What to do after each kind of error; a kind that is not here is told all in its message."""
