@@ -125,7 +125,7 @@ def rpc() -> str:
         for topic, message in PUBLISHED.items()
     ]
     put = [
-        (_code(f"hmt/site/robot/in/{n}"), "put", " or ".join(map(_code, s)))
+        (_code(f"hmt/site/robot/in/{n}"), "put", " or ".join(map(_code, sorted(s))))
         for n, s in taken.items()
     ]
     lines += _table(["key", "direction", "payload"], [*published, *put])
