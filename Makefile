@@ -7,7 +7,7 @@ PROTO := proto/hmt_service/service/v1/hmt.proto
 PROTOC = $(BIN)/python -m grpc_tools.protoc -I proto
 
 .DEFAULT_GOAL := test
-.PHONY: demo test lint bench proto proto-is-fresh clean
+.PHONY: demo test lint bench proto proto-is-fresh docs clean
 
 $(INSTALLED): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python >= 3.11 is needed")'
@@ -41,6 +41,9 @@ proto-is-fresh: $(INSTALLED)
 		file=$(PROTO:proto/%.proto=%)_pb2.$$suffix; \
 		diff "$$file" "$$fresh/$$file" || { echo "$$file is stale: run 'make proto'"; exit 1; }; \
 	done
+
+docs: $(INSTALLED)
+	$(BIN)/python docs/generate.py
 
 clean:
 	rm -rf $(VENV) build dist out *.egg-info

@@ -9,6 +9,7 @@
     +-- Unavailable       the answer does not exist yet, or nobody is there to give it
     |   +-- DeadlineExceeded the answer takes longer than anybody waits for it
     |   +-- AccessDenied  somebody is there, and does not let these credentials ask
+    |   +-- Unreachable   a server of public logs that this machine has no way to
     +-- DaemonFailure     a process of the daemon died or did not start
 
 References: own.
@@ -65,6 +66,10 @@ class DeadlineExceeded(Unavailable):
 
 class AccessDenied(Unavailable):
     """Somebody is there to answer, and does not let these credentials ask."""
+
+
+class Unreachable(Unavailable):
+    """A server of public logs that this machine has no way to."""
 
 
 class DaemonFailure(HmtError):

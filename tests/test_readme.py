@@ -14,6 +14,7 @@ from hmt_service.service.readings import Refusal
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
+PAGES = [README, *(page.read_text() for page in sorted((ROOT / "docs").glob("*.md")))]
 COMMANDS = sorted(typer.main.get_group(app).commands)
 
 
@@ -23,8 +24,9 @@ def test_every_command_is_documented(command: str) -> None:
 
 
 def test_every_documented_command_exists() -> None:
-    named = set(re.findall(r"^hmt ([a-z]+)", README, flags=re.MULTILINE))
-    assert named <= set(COMMANDS)
+    for page in PAGES:
+        named = set(re.findall(r"(?:^|`)hmt ([a-z]+)", page, flags=re.MULTILINE))
+        assert named <= set(COMMANDS)
 
 
 @pytest.mark.parametrize("target", re.findall(r"`?make ([a-z]+)", README))

@@ -12,7 +12,9 @@ import typer
 from hmt_service import __version__
 from hmt_service.cli import (
     control,
+    datasets,
     demo,
+    doctor,
     evaluate,
     inspect,
     map_files,
@@ -27,7 +29,6 @@ app = typer.Typer(
     name="hmt",
     help="Hybrid metric-topological SLAM.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
 )
 
@@ -51,6 +52,7 @@ def _options(
 
 
 app.command("demo")(demo.demo)
+app.command("doctor")(doctor.doctor)
 app.command("run")(run.run)
 app.command("inspect")(inspect.inspect)
 app.command("sim")(sim.sim)
@@ -65,6 +67,7 @@ app.command("areas")(query.areas)
 app.command("map")(query.map_)
 app.command("compare")(query.compare)
 app.add_typer(control.app, name="ctl")
+app.add_typer(datasets.app, name="datasets")
 app.command("eval")(evaluate.evaluate)
 app.command("info")(map_files.info)
 app.command("check")(map_files.check)

@@ -15,7 +15,6 @@ from enum import StrEnum
 
 import typer
 
-from hmt_service.core.types import Event
 from hmt_service.errors import BAD_INPUT, HmtError
 
 _LOG = logging.getLogger(__name__)
@@ -39,6 +38,8 @@ class JsonLines(logging.Formatter):
 
     def format(self, record: logging.LogRecord) -> str:
         """Return the line; numbers that are not finite become null."""
+        from hmt_service.core.types import Event
+
         event = getattr(record, "event", None)
         line: dict[str, object] = {
             "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),

@@ -24,13 +24,13 @@ from hmt_service.cli.connection import (
     connected,
 )
 from hmt_service.cli.tables import print_json, print_tables, table_of
-from hmt_service.core.geometry import GaussianPose, yaw_of
-from hmt_service.core.types import EventKind, MapMethod
+from hmt_service.core.choices import EventKind, MapMethod
 
 if TYPE_CHECKING:
     from rich.table import Table
 
     from hmt_service.client import HmtClient
+    from hmt_service.core.geometry import GaussianPose
     from hmt_service.core.types import Belief, GlobalMap, Localization
     from hmt_service.service.reports import Status
 
@@ -438,6 +438,8 @@ def _pose(gaussian: GaussianPose) -> str:
     """Return position and heading with their standard deviations."""
     x, y, z = gaussian.mean[:3, 3]
     sigma_deg = math.degrees(math.sqrt(max(0.0, gaussian.covariance[2, 2])))
+    from hmt_service.core.geometry import yaw_of
+
     yaw_deg = math.degrees(yaw_of(gaussian.mean))
     return (
         f"({x:.3f}, {y:.3f}, {z:.3f}) ±{gaussian.sigma_m:.3f} m, {yaw_deg:.2f} ±{sigma_deg:.2f} deg"

@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hmt_service.core.config import Config, Preset, load_config
+from hmt_service.core.choices import Preset
 from hmt_service.errors import InvalidInput, NotFound
 
 if TYPE_CHECKING:
+    from hmt_service.core.config import Config
     from hmt_service.core.geometry import Pose
     from hmt_service.core.visits import MemoryBudget
     from hmt_service.service.kept_map import KeptMap
@@ -170,6 +171,8 @@ def load_settings(preset: Preset, config: Path | None) -> Config:
         NotFound: If the file cannot be read.
         InvalidConfig: If its content is refused.
     """
+    from hmt_service.core.config import load_config
+
     if config is None:
         return load_config(preset)
     try:

@@ -19,7 +19,8 @@ from hmt_service.client.blocking import HmtClient
 from hmt_service.errors import DaemonFailure, Unavailable
 from hmt_service.service.reports import DaemonState
 
-_START_S = 30.0
+_START_S = 120.0
+"""Long enough for a first start, which compiles what the odometry does."""
 _STOP_S = 10.0
 _POLL_S = 0.05
 

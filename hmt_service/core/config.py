@@ -7,12 +7,14 @@ References:
 from __future__ import annotations
 
 import hashlib
-from enum import StrEnum
+from collections.abc import Mapping
+from difflib import get_close_matches
 from typing import Any
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from hmt_service.core.choices import Preset as Preset
 from hmt_service.errors import InvalidConfig
 
 
@@ -249,17 +251,6 @@ class Config(Section):
         return hashlib.sha256(self.model_dump_json().encode()).hexdigest()[:12]
 
 
-class Preset(StrEnum):
-    """Settings per kind of sensor."""
-
-    PLANAR = "2d"
-    """Planar laser."""
-    INDOOR = "3d-indoor"
-    """LiDAR in buildings and garages."""
-    OUTDOOR = "3d-outdoor"
-    """LiDAR on roads, between buildings, in the open."""
-
-
 # Of what so many planes say, more of the error is the map's own. Fitted in simulated worlds.
 _SPATIAL_COVARIANCE = {"drift_share": 0.25}
 _PRESETS: dict[Preset, dict[str, Any]] = {
@@ -333,4 +324,17 @@ def load_config(preset: Preset = Preset.PLANAR, text: str | None = None) -> Conf
     try:
         return Config.model_validate(merged)
     except ValidationError as error:
-        raise InvalidConfig(f"configuration refused: {error}") from error
+        reasons = "; ".join(_reason(dict(problem)) for problem in error.errors())
+        raise InvalidConfig(f"configuration refused: {reasons}") from error
+
+
+def _reason(problem: Mapping[str, Any]) -> str:
+    """Return one line for one problem that pydantic has found."""
+    where = ".".join(map(str, problem["loc"]))
+    if problem["type"] != "extra_forbidden":
+        return f"{where}: {problem['msg']}, not {problem['input']!r}"
+    known: Mapping[str, Any] = Config().model_dump()
+    for name in problem["loc"][:-1]:
+        known = known[name]
+    near = get_close_matches(str(problem["loc"][-1]), known, n=1)
+    return f"there is no {where}" + (f"; did you mean {near[0]}?" if near else "")

@@ -18,6 +18,8 @@ from types import MappingProxyType
 import numpy as np
 import numpy.typing as npt
 
+from hmt_service.core.choices import EventKind as EventKind
+from hmt_service.core.choices import MapMethod as MapMethod
 from hmt_service.core.geometry import FloatArray, GaussianPose, Pose
 
 Points = npt.NDArray[np.float32]
@@ -120,25 +122,6 @@ class Tracking:
     """Why the scan could not be registered, if so."""
     registration: Registration | None = None
     """How it was, or failed to be; None if that was not tried."""
-
-
-class EventKind(StrEnum):
-    """What can happen to the map that somebody may want to know."""
-
-    AREA_ENTERED = "area_entered"
-    BRANCHED = "branched"
-    PRUNED = "pruned"
-    ACCEPTED = "accepted"
-    INPUT_DROPPED = "input_dropped"
-    LOST = "lost"
-    PROCESS_FAILED = "process_failed"
-    PRESET_DOUBTED = "preset_doubted"
-    PRESET_CONFIRMED = "preset_confirmed"
-    NOT_SAVED = "not_saved"
-    OVER_BUDGET = "over_budget"
-    PROCESS_RESTARTED = "process_restarted"
-    ARC_ASSERTED = "arc_asserted"
-    ARC_RETRACTED = "arc_retracted"
 
 
 @dataclass(frozen=True, slots=True)
@@ -278,13 +261,6 @@ class DropReason(StrEnum):
     """It was unlikely for many areas in a row."""
     SAME_MAP = "same_map"
     """It was the same map as another one, which has its mass."""
-
-
-class MapMethod(StrEnum):
-    """How area poses are brought into one frame (section IV-C)."""
-
-    CONSISTENT = "consistent"
-    SHORTEST_PATH = "shortest_path"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

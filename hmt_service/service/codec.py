@@ -594,6 +594,7 @@ def _status_to_proto(status: Status) -> pb.Status:
             )
             for counts in status.senders
         ],
+        clock_s=status.clock_s,
     )
 
 
@@ -642,6 +643,7 @@ def _status(message: pb.Status) -> Status:
             SenderCounts(counts.sender, Input(counts.input), counts.received, counts.lost)
             for counts in message.senders
         ),
+        clock_s=message.clock_s,
     )
 
 

@@ -15,7 +15,7 @@ import os
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -65,6 +65,7 @@ from hmt_service.service.questions import Name, Question, receive
 from hmt_service.service.readings import ReadingDecoder
 from hmt_service.service.reports import Ack, DaemonState, Status
 from hmt_service.service.ros2 import Ros2Input, encoding_under, input_of
+from hmt_service.service.rpc import ARC, RPCS
 from hmt_service.service.senders import Senders
 
 _LOG = logging.getLogger(__name__)
@@ -74,12 +75,6 @@ _WARNINGS = (
     EventKind.OVER_BUDGET,
     EventKind.PROCESS_FAILED,
 )
-_NUMBERS = ("x", "y", "z", "qx", "qy", "qz", "qw", "sigma_m", "sigma_rad", "probability")
-_PARAMETERS: Mapping[Control, tuple[str, ...]] = {
-    Control.LOAD: ("map",),
-    Control.ASSERT_ARC: ("area_a", "area_b", *_NUMBERS),
-    Control.RETRACT_ARC: ("statement",),
-}
 _KEPT_EVENTS = 1000
 _KEPT_BELIEFS = 20_000
 _ANSWER_S = 8.0
@@ -269,6 +264,7 @@ class Gateway:
             stored_keyframes=self._report.stored_keyframes,
             localization=snapshot.localization if snapshot else None,
             senders=self._senders.counts(),
+            clock_s=time.time(),
         )
 
     def on_tracking(self, tracking: Tracking) -> None:
@@ -372,9 +368,9 @@ class Gateway:
         receive(query, keys, self._handle_control)
 
     def _handle_call(self, question: Question[Call]) -> Value | None:
+        question.allow(*RPCS[question.name].parameters)
         match question.name:
             case Call.MAP:
-                question.allow("method", "reference", "hypothesis", "points", "known")
                 return self._ask(
                     question,
                     MapRequest(
@@ -386,13 +382,10 @@ class Gateway:
                     ),
                 )
             case Call.AREA:
-                question.allow("area", "reference", "hypothesis", "points", "known")
                 return self._ask(question, _area_request(question))
             case Call.TRAJECTORY:
-                question.allow("from", "to", "hypothesis")
                 return self._ask(question, _trajectory_request(question))
             case Call.AREAS:
-                question.allow("reference", "hypothesis")
                 return self._ask(
                     question,
                     MapRequest(
@@ -403,21 +396,18 @@ class Gateway:
                     ),
                 )
             case Call.COMPARE:
-                question.allow("reference", "hypothesis")
                 return self._ask(
                     question,
                     CompareRequest(question.integer("reference"), question.integer("hypothesis")),
                 )
             case Call.STATUS | Call.POSE:
-                question.allow()
                 return self._latest(question.name)
             case _:
-                question.allow()
                 question.reply(self._latest_encoded(question.name))
                 return None
 
     def _handle_control(self, question: Question[Control]) -> Value | None:
-        question.allow(*_PARAMETERS.get(question.name, ()))
+        question.allow(*RPCS[question.name].parameters)
         match question.name:
             case Control.FINISH if self._is_stopping:
                 raise Unavailable("the daemon is stopping, and saves the map by itself")
@@ -491,7 +481,7 @@ class Gateway:
 
 
 def _statement(question: Question[Control]) -> AssertArcRequest:
-    x, y, z, *quaternion, sigma_m, sigma_rad, probability = map(question.needed_number, _NUMBERS)
+    x, y, z, *quaternion, sigma_m, sigma_rad, probability = map(question.needed_number, ARC)
     if sigma_m <= 0.0 or sigma_rad <= 0.0:
         raise InvalidInput(f"standard deviations {sigma_m:g} m, {sigma_rad:g} rad are not above 0")
     pose = pose_of(np.array(quaternion), np.array([x, y, z]))

@@ -100,6 +100,9 @@ class Status:
     """How sure it is where the robot is; None before the first keyframe."""
     senders: tuple[SenderCounts, ...]
     """What arrived of senders that number what they send; of the last hundred."""
+    clock_s: float
+    """Wall clock of the daemon's machine when it answered, s since 1970-01-01 UTC; 0: an older one,
+    which does not tell."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,6 +11,7 @@ References:
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
@@ -21,6 +22,9 @@ import zenoh
 from hmt_service.errors import InvalidConfig, NotFound, Unavailable
 from hmt_service.service.keys import DEFAULT_ENDPOINT
 from hmt_service.service.strangers import refuse_strangers
+
+_SOURCE_LINE = re.compile(r" at \S+\.rs:\d+\.?")
+"""Where in Zenoh's own code something was noticed."""
 
 
 class Mode(StrEnum):
@@ -132,7 +136,8 @@ def open_session(endpoints: Endpoints) -> zenoh.Session:
             refuse_strangers(config, endpoints.listen, has_scouting=endpoints.has_scouting)
         return zenoh.open(config)
     except zenoh.ZError as error:
-        raise Unavailable(f"no Zenoh session {endpoints}: {error}") from error
+        reason = _SOURCE_LINE.sub("", str(error))
+        raise Unavailable(f"no Zenoh session {endpoints}: {reason}") from error
 
 
 def _read(path: Path | None) -> zenoh.Config:

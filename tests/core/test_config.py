@@ -75,3 +75,18 @@ def test_equal_settings_have_the_hash_of_every_run() -> None:
 def test_settings_cannot_be_changed_after_validation() -> None:
     with pytest.raises(ValidationError, match="frozen"):
         OdometryConfig().voxel_size_m = 0.2  # type: ignore[misc]
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("odometry: {keyframe_distance: 1}", "did you mean keyframe_distance_m?"),
+        ("odometri: {}", "there is no odometri; did you mean odometry?"),
+        ("sensor: {xyz: 1}", "there is no sensor.xyz$"),
+        ("odometry: {min_points: 1}", "odometry.min_points: Input should be .* 3, not 1"),
+        ("sensor: 5", "sensor: Input should be .*, not 5"),
+    ],
+)
+def test_what_is_refused_says_what_would_do(text: str, reason: str) -> None:
+    with pytest.raises(InvalidConfig, match=reason.replace("?", "[?]")):
+        load_config(text=text)

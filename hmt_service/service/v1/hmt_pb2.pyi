@@ -498,7 +498,7 @@ class SenderCounts(_message.Message):
     def __init__(self, sender: _Optional[int] = ..., input: _Optional[str] = ..., received: _Optional[int] = ..., lost: _Optional[int] = ...) -> None: ...
 
 class Status(_message.Message):
-    __slots__ = ("version", "config_hash", "state", "uptime_s", "input", "tracked_scans", "processed_scans", "processes", "revision", "areas", "arcs", "keyframes", "hypotheses", "stored_keyframes", "localization", "hypothesis", "senders")
+    __slots__ = ("version", "config_hash", "state", "uptime_s", "input", "tracked_scans", "processed_scans", "processes", "revision", "areas", "arcs", "keyframes", "hypotheses", "stored_keyframes", "localization", "hypothesis", "senders", "clock_s")
     VERSION_FIELD_NUMBER: _ClassVar[int]
     CONFIG_HASH_FIELD_NUMBER: _ClassVar[int]
     STATE_FIELD_NUMBER: _ClassVar[int]
@@ -516,6 +516,7 @@ class Status(_message.Message):
     LOCALIZATION_FIELD_NUMBER: _ClassVar[int]
     HYPOTHESIS_FIELD_NUMBER: _ClassVar[int]
     SENDERS_FIELD_NUMBER: _ClassVar[int]
+    CLOCK_S_FIELD_NUMBER: _ClassVar[int]
     version: str
     config_hash: str
     state: DaemonState
@@ -533,7 +534,8 @@ class Status(_message.Message):
     localization: Localization
     hypothesis: int
     senders: _containers.RepeatedCompositeFieldContainer[SenderCounts]
-    def __init__(self, version: _Optional[str] = ..., config_hash: _Optional[str] = ..., state: _Optional[_Union[DaemonState, str]] = ..., uptime_s: _Optional[float] = ..., input: _Optional[_Union[InputCounts, _Mapping]] = ..., tracked_scans: _Optional[int] = ..., processed_scans: _Optional[int] = ..., processes: _Optional[_Iterable[_Union[ProcessStatus, _Mapping]]] = ..., revision: _Optional[int] = ..., areas: _Optional[int] = ..., arcs: _Optional[int] = ..., keyframes: _Optional[int] = ..., hypotheses: _Optional[int] = ..., stored_keyframes: _Optional[int] = ..., localization: _Optional[_Union[Localization, _Mapping]] = ..., hypothesis: _Optional[int] = ..., senders: _Optional[_Iterable[_Union[SenderCounts, _Mapping]]] = ...) -> None: ...
+    clock_s: float
+    def __init__(self, version: _Optional[str] = ..., config_hash: _Optional[str] = ..., state: _Optional[_Union[DaemonState, str]] = ..., uptime_s: _Optional[float] = ..., input: _Optional[_Union[InputCounts, _Mapping]] = ..., tracked_scans: _Optional[int] = ..., processed_scans: _Optional[int] = ..., processes: _Optional[_Iterable[_Union[ProcessStatus, _Mapping]]] = ..., revision: _Optional[int] = ..., areas: _Optional[int] = ..., arcs: _Optional[int] = ..., keyframes: _Optional[int] = ..., hypotheses: _Optional[int] = ..., stored_keyframes: _Optional[int] = ..., localization: _Optional[_Union[Localization, _Mapping]] = ..., hypothesis: _Optional[int] = ..., senders: _Optional[_Iterable[_Union[SenderCounts, _Mapping]]] = ..., clock_s: _Optional[float] = ...) -> None: ...
 
 class Ack(_message.Message):
     __slots__ = ("received", "accepted", "refused", "processed_scans", "files")

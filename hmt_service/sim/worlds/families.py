@@ -6,20 +6,17 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
+from importlib import import_module
 from types import MappingProxyType
+from typing import TYPE_CHECKING, cast
 
 from hmt_service.errors import InvalidInput
-from hmt_service.sim.worlds.aliased import aliased
-from hmt_service.sim.worlds.campus import campus
-from hmt_service.sim.worlds.garage import garage
-from hmt_service.sim.worlds.long import long
-from hmt_service.sim.worlds.nested_loops import nested_loops
-from hmt_service.sim.worlds.office import office
-from hmt_service.sim.worlds.warehouse import warehouse
-from hmt_service.sim.worlds.world import World
+
+if TYPE_CHECKING:
+    from hmt_service.sim.worlds.world import World
 
 
 class Family(StrEnum):
@@ -84,8 +81,6 @@ class Recipe:
 
     description: str
     """One sentence."""
-    draw: Callable[..., World]
-    """Takes the seed, and the parameters by name."""
     route_m: tuple[float, float]
     """Least and greatest length of the route with default parameters, m."""
     parameters: tuple[Parameter, ...] = ()
@@ -98,42 +93,35 @@ RECIPES: Mapping[Family, Recipe] = MappingProxyType(
     {
         Family.OFFICE: Recipe(
             "One floor of an office: a ring of corridors, one across it, rooms on both sides.",
-            office,
             (150.0, 230.0),
             (_LAPS,),
         ),
         Family.ALIASED: Recipe(
             "A ring of corridors or twin wings, drawn by the seed, with rooms that look the same.",
-            aliased,
             (150.0, 300.0),
             (Parameter("severity", 0, 1, 0.9, "Share of rooms that are exact copies of one."),),
         ),
         Family.NESTED_LOOPS: Recipe(
             "Long corridors: two small loops inside a large one, which is closed late.",
-            nested_loops,
             (550.0, 800.0),
             (_LAPS,),
         ),
         Family.CAMPUS: Recipe(
             "2 km of paths between buildings, trees and cars, and through three halls, over hills.",
-            campus,
             (1800.0, 2200.0),
             (Parameter("relief_m", 0, 4, 1.5, "Greatest height over the mean; 0 is flat."),),
         ),
         Family.WAREHOUSE: Recipe(
             "Rows of equal racks with loads that vary a little, cross aisles, docks.",
-            warehouse,
             (300.0, 500.0),
         ),
         Family.GARAGE: Recipe(
             "Parking floors that look alike one above the other, joined by ramps; for LiDARs.",
-            garage,
             (550.0, 650.0),
             (Parameter("floors", 2, 6, 3, "Number of floors.", is_whole=True),),
         ),
         Family.LONG: Recipe(
             "Any number of small areas in rows, a loop in each row, to measure how cost grows.",
-            long,
             (650.0, 850.0),
             (Parameter("areas", 1, 100_000, 100, "Number of areas.", is_whole=True),),
         ),
@@ -160,4 +148,9 @@ def draw(family: Family, seed: int, **parameters: float) -> World:
     if unknown := sorted(set(parameters) - set(known)):
         choices = ", ".join(str(parameter) for parameter in recipe.parameters) or "none"
         raise InvalidInput(f"{family} has no parameter {', '.join(unknown)}; it has {choices}")
-    return recipe.draw(seed, **{name: known[name].checked(parameters[name]) for name in parameters})
+    checked = {name: known[name].checked(parameters[name]) for name in parameters}
+    # Each family is a module with a function of its name, loaded only now: the command line lists
+    # families before numpy is there.
+    name = family.replace("-", "_")
+    build = getattr(import_module(f"hmt_service.sim.worlds.{name}"), name)
+    return cast("World", build(seed, **checked))
