@@ -10,7 +10,18 @@ from typing import Annotated
 import typer
 
 from hmt_service import __version__
-from hmt_service.cli import control, demo, evaluate, map_files, query, replay, run, serve, sim
+from hmt_service.cli import (
+    control,
+    demo,
+    evaluate,
+    map_files,
+    query,
+    replay,
+    report,
+    run,
+    serve,
+    sim,
+)
 
 app = typer.Typer(
     name="hmt",
@@ -54,6 +65,7 @@ app.command("map")(query.map_)
 app.command("compare")(query.compare)
 app.add_typer(control.app, name="ctl")
 app.command("eval")(evaluate.evaluate)
+app.command("report")(report.report)
 app.command("info")(map_files.info)
 app.command("check")(map_files.check)
 app.command("export")(map_files.export)
