@@ -21,6 +21,7 @@ from hmt_service.cli import (
     run,
     serve,
     sim,
+    view,
 )
 
 app = typer.Typer(
@@ -63,6 +64,7 @@ app.command("events")(query.events)
 app.command("areas")(query.areas)
 app.command("map")(query.map_)
 app.command("compare")(query.compare)
+app.command("view")(view.view)
 app.add_typer(control.app, name="ctl")
 app.command("eval")(evaluate.evaluate)
 app.command("report")(report.report)
