@@ -169,10 +169,18 @@ def test_live_it_follows_a_daemon_and_draws_what_changes(tmp_path: Path) -> None
     assert rows["/map/path"] > 0
 
 
-def test_live_a_missing_hypothesis_is_refused(tmp_path: Path) -> None:
+def test_live_a_recording_is_complete_when_it_is_stopped(tmp_path: Path) -> None:
+    out = tmp_path / "live.rrd"
+    part = out.with_name("live.rrd.part")
     with running_daemon(tmp_path / "out") as daemon, daemon.client() as client:
         for reading in readings(20):
             client.publish(reading)
         client.finish()
         with pytest.raises(NotFound, match="hypothesis 4711 is not one of"):
             LiveView(client, View("test"), 4711).run(lambda: True)
+        with viewing("--connect", daemon.endpoint, "--save", out) as process:
+            wait_until(lambda: part.exists() and b"/map/areas/0/points" in part.read_bytes())
+            assert not out.exists()
+    assert process.returncode == 0
+    assert not part.exists()
+    assert entities_in(out)["/map/areas/0/points"] == 1
