@@ -20,9 +20,11 @@ from hmt_service.cli import (
     map_files,
     query,
     replay,
+    report,
     run,
     serve,
     sim,
+    view,
 )
 
 app = typer.Typer(
@@ -66,9 +68,11 @@ app.command("events")(query.events)
 app.command("areas")(query.areas)
 app.command("map")(query.map_)
 app.command("compare")(query.compare)
+app.command("view")(view.view)
 app.add_typer(control.app, name="ctl")
 app.add_typer(datasets.app, name="datasets")
 app.command("eval")(evaluate.evaluate)
+app.command("report")(report.report)
 app.command("info")(map_files.info)
 app.command("check")(map_files.check)
 app.command("export")(map_files.export)

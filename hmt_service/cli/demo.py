@@ -34,7 +34,7 @@ def demo(
 
     from hmt_service.client import HmtClient
     from hmt_service.client.local import local_daemon
-    from hmt_service.service.results import TRAJECTORY
+    from hmt_service.io.saved_run import TRAJECTORY
     from hmt_service.sim.simulation import INDOOR_LASER, simulate
     from hmt_service.sim.worlds.office import office
 

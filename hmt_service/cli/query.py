@@ -176,7 +176,7 @@ def events(
     """
     if run is not None:
         from hmt_service.io.audit_files import read_events
-        from hmt_service.service.results import EVENTS
+        from hmt_service.io.saved_run import EVENTS
 
         answer = read_events(run / EVENTS)
     else:
@@ -307,7 +307,7 @@ def _history(
         with connected(connect, site, robot, zenoh_config, timeout_s=timeout_s) as client:
             return client.history().beliefs
     from hmt_service.io.audit_files import read_beliefs
-    from hmt_service.service.results import BELIEFS
+    from hmt_service.io.saved_run import BELIEFS
 
     return read_beliefs(run / BELIEFS)
 

@@ -6,9 +6,11 @@ References:
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -39,6 +41,8 @@ _WHY = {
 }
 # Beliefs that differ by no more than this are one that lasts.
 _EQUAL = 1e-6
+# One hypothesis weighs at most 0.995 then.
+_DOUBT_ESS = 1.01
 
 
 class Audit:
@@ -97,6 +101,68 @@ def between(beliefs: Sequence[Belief], start_s: float, end_s: float) -> tuple[Be
     if inside and is_cut:
         inside.append(replace(inside[-1], stamp_s=end_s))
     return tuple(inside)
+
+
+def decisive(events: Sequence[Event], most: int) -> tuple[Event, ...]:
+    """Return the decisions that most probability hung on, in order of time.
+
+    At a branch that is what a successor got of its parent, or what the others got, whichever is
+    less; of a hypothesis that was dropped, or of the last others at an acceptance, what it weighed.
+
+    Args:
+        events: In order of time.
+        most: How many at most.
+    """
+    shares = _shares(events)
+    mass = {}
+    for place, event in enumerate(events):
+        numbers = event.numbers
+        if place in shares:
+            mass[place] = numbers["parent_probability"] * min(shares[place], 1.0 - shares[place])
+        elif event.kind is EventKind.PRUNED and "same_as" not in numbers:
+            mass[place] = math.exp(numbers["log_weight"])
+        elif event.kind is EventKind.ACCEPTED:
+            mass[place] = numbers.get("last_dropped_mass", 0.0)
+    chosen = sorted(mass, key=lambda place: (-mass[place], place))[:most]
+    return tuple(events[place] for place in sorted(chosen))
+
+
+def _shares(events: Sequence[Event]) -> dict[int, float]:
+    """Return the share of its parent that each branch got, by its place among the events."""
+    families: dict[tuple[float, float], list[int]] = {}
+    for place, event in enumerate(events):
+        if event.kind is EventKind.BRANCHED:
+            families.setdefault((event.stamp_s, event.numbers["parent"]), []).append(place)
+    shares: dict[int, float] = {}
+    for family in families.values():
+        factors = np.array([events[place].numbers["log_factor"] for place in family])
+        weights = np.exp(factors - factors.max())
+        shares.update(zip(family, (weights / weights.sum()).tolist(), strict=True))
+    return shares
+
+
+def longest_doubt(beliefs: Sequence[Belief]) -> tuple[float, float] | None:
+    """Return begin and end, sensor time, of what was in doubt most and longest, and of its margin.
+
+    That is where more than one topology counted, an effective sample size above one, summed over
+    time; None if there was no doubt.
+
+    Args:
+        beliefs: In order of time; each lasts until the next.
+    """
+    best, most, begin, doubt = None, 0.0, None, 0.0
+    for belief, after in pairwise(beliefs):
+        if belief.effective_sample_size < _DOUBT_ESS:
+            begin, doubt = None, 0.0
+            continue
+        begin = belief.stamp_s if begin is None else begin
+        doubt += (after.stamp_s - belief.stamp_s) * (belief.effective_sample_size - 1.0)
+        if doubt > most:
+            best, most = (begin, after.stamp_s), doubt
+    if best is None:
+        return None
+    margin_s = 0.25 * (best[1] - best[0])
+    return best[0] - margin_s, best[1] + margin_s
 
 
 def _is_same(first: Belief, second: Belief) -> bool:

@@ -248,7 +248,12 @@ class Config(Section):
 
     def hash(self) -> str:
         """Return twelve hexadecimal digits that change when any setting does."""
-        return hashlib.sha256(self.model_dump_json().encode()).hexdigest()[:12]
+        return hash_of(self.model_dump_json())
+
+
+def hash_of(config_json: str) -> str:
+    """Return the hash of settings that `Config.model_dump_json` has written."""
+    return hashlib.sha256(config_json.encode()).hexdigest()[:12]
 
 
 # Of what so many planes say, more of the error is the map's own. Fitted in simulated worlds.

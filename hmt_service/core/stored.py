@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from hmt_service.core.chunked import Chunked
-from hmt_service.core.config import Config
+from hmt_service.core.config import Config, hash_of
 from hmt_service.core.geometry import GaussianPose, Pose, exp, log
 from hmt_service.core.types import Keyframe
 from hmt_service.errors import InvalidInput
@@ -163,6 +163,11 @@ class StoredMap:
     """All hypotheses that are alive, in the engine's order."""
     scans: Sequence[StoredScan]
     """In the order that they came."""
+
+    @property
+    def config_hash(self) -> str:
+        """`Config.hash` of the settings, as the version that has written them computes it."""
+        return hash_of(self.config_json)
 
     @property
     def config(self) -> Config:

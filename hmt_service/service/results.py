@@ -15,14 +15,11 @@ from typing import TYPE_CHECKING
 from hmt_service import __version__
 from hmt_service.core.config import Config
 from hmt_service.errors import Unavailable
+from hmt_service.io.saved_run import BELIEFS, EVENTS, MAP, SUMMARY, TRAJECTORY
 from hmt_service.runtime.messages import RunReport
 
 if TYPE_CHECKING:
     from hmt_service.core.engine import Engine
-
-TRAJECTORY, MAP, SUMMARY = "trajectory.tum", "map.hmt", "summary.json"
-EVENTS, BELIEFS = "events.jsonl", "posterior.jsonl"
-"""Names of the files."""
 
 
 def save_results(

@@ -1,1 +1,1 @@
-"""Figures."""
+"""Figures, the report of a run, and the view in Rerun."""

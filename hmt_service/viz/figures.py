@@ -31,6 +31,7 @@ _COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#
 _CONTRADICTION = "#D00000"
 _INK = "#202020"
 _SHADE = "#20202028"
+_GREY, _PATH = "#8C8C8C", "#0072B2"
 _CHI2_95_2 = 5.991
 """95 % quantile of the chi-squared distribution with two degrees of freedom."""
 _CROWD = 60
@@ -39,6 +40,8 @@ _MARKED_ARCS = 5
 _LEAST_MARKED_M = 0.05
 _PANEL_IN = 8.0
 _LEGEND_ENTRY_IN = 2.6
+_AROUND_IN = 1.7
+"""Height of a title, an axis and a legend of three rows."""
 _MARGIN_M = 1.0
 _HALO = (withStroke(linewidth=2.5, foreground="white"),)
 _TITLES = {MapMethod.CONSISTENT: "Globally consistent", MapMethod.SHORTEST_PATH: "Shortest paths"}
@@ -58,32 +61,114 @@ def draw_maps(maps: Sequence[GlobalMap], comparison: Comparison | None, path: Pa
         NotFound: If the folder of the image does not exist.
     """
     check_image(path)
-    if not maps or not all(each.areas for each in maps):
-        raise InvalidInput(f"{len(maps)} maps with {[len(m.areas) for m in maps]} areas to draw")
-    colours = area_colours(maps)
-    low, high = _limits(maps)
-    width, height = high - low
-    scale = _PANEL_IN / max(width, height)
-    size = (len(maps) * max(scale * width, 3.5) + 0.8, max(scale * height, 2.0) + 1.2)
-    figure = Figure(figsize=size, layout="constrained")
-    panels = figure.subplots(1, len(maps), sharex=True, sharey=True, squeeze=False)[0]
+    _maps_figure(maps, maps, comparison, panel_in=_PANEL_IN).savefig(path, dpi=150)
+
+
+def map_figures(
+    maps: Sequence[GlobalMap], comparison: Comparison | None, *, panel_in: float
+) -> list[Figure]:
+    """Return what `draw_maps` draws as a figure per map, for pages that are narrower than both.
+
+    Args:
+        maps: One figure each, all of the same extent and scale.
+        comparison: As in `draw_maps`.
+        panel_in: Longer side of a panel, inch.
+
+    Raises:
+        InvalidInput: If there is no map, or one without areas.
+    """
+    return [_maps_figure([each], maps, comparison, panel_in=panel_in) for each in maps]
+
+
+def topology_figure(shown: GlobalMap, positions: FloatArray, *, panel_in: float) -> Figure:
+    """Return the map with the path of the robot and the areas and arcs over it (Fig. 9(a)).
+
+    Args:
+        shown: The map.
+        positions: Where the robot was, in its reference frame, shape (N, 3), m.
+        panel_in: Longer side of the panel, inch.
+
+    Raises:
+        InvalidInput: If the map has no areas.
+    """
+    figure, (axes,) = _panels(1, [shown], panel_in)
+    axes.plot(*positions[:, :2].T, color=_PATH, linewidth=0.9, zorder=1.5)
+    _draw_points(axes, shown, dict.fromkeys((area.area for area in shown.areas), _GREY))
+    _draw_topology(axes, shown)
+    handles = [Line2D([], [], color=_PATH, label="path of the robot"), *_legend()[:3]]
+    _finish(figure, [axes], handles)
+    return figure
+
+
+def poses_figure(shown: GlobalMap, *, panel_in: float, magnified: float) -> Figure:
+    """Return the poses of the areas with their ellipses alone (Fig. 9(d)).
+
+    Args:
+        shown: The map.
+        panel_in: Longer side of the panel, inch.
+        magnified: How many times longer than true the axes of the ellipses are drawn, > 0.
+
+    Raises:
+        InvalidInput: If the map has no areas.
+    """
+    figure, (axes,) = _panels(1, [shown], panel_in)
+    _draw_topology(axes, shown)
+    _draw_ellipses(axes, shown, magnified=magnified)
+    _finish(figure, [axes], _legend(magnified=magnified))
+    return figure
+
+
+def _maps_figure(
+    maps: Sequence[GlobalMap],
+    extent_of: Sequence[GlobalMap],
+    comparison: Comparison | None,
+    *,
+    panel_in: float,
+) -> Figure:
+    figure, panels = _panels(len(maps), extent_of, panel_in)
+    colours = area_colours(extent_of)
+    is_marked = False
     for axes, each in zip(panels, maps, strict=True):
-        axes.set(aspect="equal", xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-        _draw_map(axes, each, colours)
+        _draw_points(axes, each, colours)
+        _draw_topology(axes, each)
+        _draw_ellipses(axes, each)
         if comparison is not None and each.method is MapMethod.SHORTEST_PATH:
             _mark_contradictions(axes, each, comparison.arcs)
+            is_marked = True
         axes.set_title(_title(each), fontsize=11)
+    _finish(figure, panels, _legend(has_marks=is_marked))
+    return figure
+
+
+def _panels(
+    count: int, maps: Sequence[GlobalMap], panel_in: float
+) -> tuple[Figure, Sequence[Axes]]:
+    """Return panels side by side in which all maps have room."""
+    if not maps or not all(each.areas for each in maps):
+        raise InvalidInput(f"{len(maps)} maps with {[len(m.areas) for m in maps]} areas to draw")
+    low, high = _limits(maps)
+    width, height = high - low
+    scale = panel_in / max(width, height)
+    size = (count * max(scale * width, 3.5) + 0.8, max(scale * height, 1.5) + _AROUND_IN)
+    figure = Figure(figsize=size, layout="constrained")
+    panels: Sequence[Axes] = figure.subplots(1, count, sharex=True, sharey=True, squeeze=False)[0]
+    for axes in panels:
+        axes.set(aspect="equal", xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+    return figure, panels
+
+
+def _finish(figure: Figure, panels: Sequence[Axes], legend: list[Line2D]) -> None:
+    for axes in panels:
         axes.set_xlabel("x / m")
         axes.grid(color="0.92", linewidth=0.6)
         axes.set_axisbelow(True)
     panels[0].set_ylabel("y / m")
     figure.legend(
-        handles=_legend(has_marks=comparison is not None),
+        handles=legend,
         loc="outside lower center",
-        ncols=max(1, int(size[0] / _LEGEND_ENTRY_IN)),
+        ncols=max(1, int(figure.get_size_inches()[0] / _LEGEND_ENTRY_IN)),
         frameon=False,
     )
-    figure.savefig(path, dpi=150)
 
 
 def check_image(path: Path) -> None:
@@ -138,8 +223,11 @@ def _title(shown: GlobalMap) -> str:
     )
 
 
-def _legend(*, has_marks: bool) -> list[Line2D]:
+def _legend(*, has_marks: bool = False, magnified: float = 1.0) -> list[Line2D]:
     """Return one sample of everything that stands in a panel."""
+    ellipse = "95 % ellipse of the position"
+    if magnified != 1.0:
+        ellipse += f", {magnified:g} times as large"
     entries = [
         Line2D([], [], linestyle="none", marker="o", markersize=3.0, color=_INK, label="area"),
         Line2D(
@@ -162,7 +250,7 @@ def _legend(*, has_marks: bool) -> list[Line2D]:
             markerfacecolor=_SHADE,
             markeredgecolor=_INK,
             markeredgewidth=0.8,
-            label="95 % ellipse of the position",
+            label=ellipse,
         ),
     ]
     if has_marks:
@@ -184,7 +272,7 @@ def _limits(maps: Sequence[GlobalMap]) -> tuple[FloatArray, FloatArray]:
     return points.min(axis=0) - _MARGIN_M, points.max(axis=0) + _MARGIN_M
 
 
-def _draw_map(axes: Axes, shown: GlobalMap, colours: Mapping[int, str]) -> None:
+def _draw_points(axes: Axes, shown: GlobalMap, colours: Mapping[int, str]) -> None:
     for area in shown.areas:
         points = transform_points(area.reference_from_area.mean, area.points_in_area)
         axes.plot(
@@ -197,14 +285,15 @@ def _draw_map(axes: Axes, shown: GlobalMap, colours: Mapping[int, str]) -> None:
             rasterized=True,
             zorder=1,
         )
-    origins = _origins(shown)
-    _draw_arcs(axes, shown.arcs, origins)
+
+
+def _draw_ellipses(axes: Axes, shown: GlobalMap, *, magnified: float = 1.0) -> None:
     ellipses = np.array([position_ellipse(area.reference_from_area) for area in shown.areas])
-    at = np.array(list(origins.values()))
+    at = np.array(list(_origins(shown).values()))
     axes.add_collection(
         EllipseCollection(
-            ellipses[:, 0],
-            ellipses[:, 1],
+            magnified * ellipses[:, 0],
+            magnified * ellipses[:, 1],
             np.degrees(ellipses[:, 2]),
             units="xy",
             offsets=at,
@@ -216,6 +305,12 @@ def _draw_map(axes: Axes, shown: GlobalMap, colours: Mapping[int, str]) -> None:
         ),
         autolim=False,
     )
+
+
+def _draw_topology(axes: Axes, shown: GlobalMap) -> None:
+    origins = _origins(shown)
+    _draw_arcs(axes, shown.arcs, origins)
+    at = np.array(list(origins.values()))
     axes.plot(*at.T, "o", markersize=3.0, color=_INK, zorder=4)
     axes.plot(
         *origins[shown.reference_area], "s", markersize=8.0, color=_INK, fillstyle="none", zorder=4

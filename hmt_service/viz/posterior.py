@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from hmt_service.core.geometry import FloatArray
 from hmt_service.core.types import Belief
@@ -30,8 +31,6 @@ _COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#
 def draw_history(beliefs: Sequence[Belief], path: Path) -> None:
     """Draw effective sample size, probabilities of topologies, and those of areas over time.
 
-    The topologies share a panel, each hypothesis stacked on those before it in a colour of its own.
-
     Args:
         beliefs: In time order; each lasts until the next.
         path: Image to write; its suffix says the format.
@@ -41,11 +40,26 @@ def draw_history(beliefs: Sequence[Belief], path: Path) -> None:
         NotFound: If the folder of the image does not exist.
     """
     check_image(path)
+    history_figure(beliefs).savefig(path, dpi=150)
+
+
+def history_figure(beliefs: Sequence[Belief], *, width_in: float = _WIDTH_IN) -> Figure:
+    """Return effective sample size, probabilities of topologies, and those of areas over time.
+
+    The topologies share a panel, each hypothesis stacked on those before it in a colour of its own.
+
+    Args:
+        beliefs: In time order; each lasts until the next.
+        width_in: Width of the figure, inch.
+
+    Raises:
+        InvalidInput: If there is nothing to draw.
+    """
     if not beliefs:
         raise InvalidInput("no belief to draw: none between the two times")
     areas = doubted_areas(beliefs)
     stamps_s = np.array([belief.stamp_s for belief in beliefs])
-    size = (_WIDTH_IN, _PANEL_IN * (len(areas) + 2) + 0.9)
+    size = (width_in, _PANEL_IN * (len(areas) + 2) + 0.9)
     figure = Figure(figsize=size, layout="constrained")
     panels: list[Axes] = list(figure.subplots(len(areas) + 2, 1, sharex=True, squeeze=False)[:, 0])
     ess = np.array([belief.effective_sample_size for belief in beliefs])
@@ -61,8 +75,11 @@ def draw_history(beliefs: Sequence[Belief], path: Path) -> None:
         axes.grid(color="0.92", linewidth=0.6)
         axes.set_axisbelow(True)
     panels[-1].set_xlabel("sensor time / s")
+    # In full, so that they can be given to --start and --end.
+    panels[-1].ticklabel_format(axis="x", style="plain", useOffset=False)
+    panels[-1].xaxis.set_major_locator(MaxNLocator(5))
     panels[0].set_title("Where the robot was believed to be", fontsize=11)
-    figure.savefig(path, dpi=150)
+    return figure
 
 
 def _stack(axes: Axes, stamps_s: FloatArray, masses: Sequence[Mapping[int, float]]) -> None:

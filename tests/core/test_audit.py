@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hmt_service.core.alignment import Aligner
-from hmt_service.core.audit import Audit, between, recognised
+from hmt_service.core.audit import Audit, between, decisive, longest_doubt, recognised
 from hmt_service.core.config import load_config
 from hmt_service.core.engine import Engine
 from hmt_service.core.odometry import Odometry
@@ -120,3 +120,44 @@ def test_a_new_area_that_turns_out_to_be_a_known_one_is_said_to_be() -> None:
     assert event.kind is EventKind.ACCEPTED
     assert event.numbers == {"hypothesis": 0.0, "visit": 2.0, "area": 0.0}
     assert "area 2 is area 0" in event.message
+
+
+def branch(stamp_s: float, parent: int, probability: float, log_factor: float) -> Event:
+    numbers = {
+        "parent": float(parent),
+        "parent_probability": probability,
+        "log_factor": log_factor,
+    }
+    return Event(EventKind.BRANCHED, stamp_s, "", numbers)
+
+
+def dropped(stamp_s: float, log_weight: float, **more: float) -> Event:
+    return Event(EventKind.PRUNED, stamp_s, "", {"log_weight": log_weight, **more})
+
+
+def test_decisive_is_what_most_probability_hung_on() -> None:
+    close = [branch(2.0, 1, 0.9, np.log(0.6)), branch(2.0, 1, 0.9, np.log(0.4))]
+    clear = [branch(1.0, 0, 1.0, 0.0), branch(1.0, 0, 1.0, -20.0)]
+    unlikely = [branch(2.0, 2, 0.1, 0.0), branch(2.0, 2, 0.1, 0.0)]
+    last = Event(EventKind.ACCEPTED, 4.0, "", {"last_dropped_mass": 0.2})
+    events = [
+        *clear,
+        *close,
+        *unlikely,
+        dropped(3.0, np.log(0.3)),
+        dropped(3.0, np.log(0.45), same_as=1.0),
+        last,
+        Event(EventKind.LOST, 5.0, ""),
+    ]
+    # 0.36 each, 0.3, 0.2, 0.05 each; one that was merged loses nothing.
+    assert decisive(events, 4) == (*close, events[6], last)
+    assert decisive(events, 6) == (*close, *unlikely, events[6], last)
+    assert decisive((), 3) == ()
+
+
+def test_longest_doubt_is_where_the_sample_size_was_above_one() -> None:
+    short = [belief(0.0, a0=1.0), belief(10.0, a0=0.5, a1=0.5), belief(11.0, a1=1.0)]
+    long = [belief(20.0, a1=0.9, a2=0.1), belief(24.0, a1=0.5, a2=0.5), belief(28.0, a2=1.0)]
+    assert longest_doubt([*short, *long]) == (18.0, 30.0)
+    assert longest_doubt(short) == (9.75, 11.25)
+    assert longest_doubt(short[:1]) is None

@@ -16,14 +16,15 @@ References:
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from colorsys import hsv_to_rgb
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+import numpy.typing as npt
 
-from hmt_service.core.geometry import FloatArray, quaternion_of
+from hmt_service.core.geometry import FloatArray, Pose, quaternion_of
 from hmt_service.core.stored import StoredFactor
 from hmt_service.errors import InvalidInput, Unavailable
 from hmt_service.io.placed_map import PlacedMap
@@ -84,12 +85,9 @@ def _areas(placed: PlacedMap) -> Iterator[Chunk]:
     yield _static("/map", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
     for area, points in placed.submaps().items():
         pose, entity = placed.reference_from_visit[area], f"/map/areas/{area}"
-        colour = _colour(area)
-        label = rr.Points3D([[0.0, 0.0, 0.0]], colors=[colour], labels=[_name(area)])
-        rotation = rr.Quaternion(xyzw=quaternion_of(pose))
-        yield _static(entity, rr.Transform3D(translation=pose[:3, 3], quaternion=rotation))
-        yield _static(f"{entity}/points", rr.Points3D(points, colors=[colour]))
-        yield _static(f"{entity}/label", label)
+        yield _static(entity, transform_of(pose))
+        yield _static(f"{entity}/points", rr.Points3D(points, colors=[colour_of(area)]))
+        yield _static(f"{entity}/label", label_of(area))
 
 
 def _arcs(placed: PlacedMap) -> Iterator[Chunk]:
@@ -120,12 +118,10 @@ def _trajectory(placed: PlacedMap) -> Iterator[Chunk]:
     lines: list[FloatArray] = [
         poses[v.first_keyframe : v.last_keyframe + 1, :3, 3] for v in placed.stored.visits
     ]
-    colours = [_colour(placed.area_of[visit.visit]) for visit in placed.stored.visits]
+    colours = [colour_of(placed.area_of[visit.visit]) for visit in placed.stored.visits]
     yield _static("/map/trajectory", rr.LineStrips3D(lines, colors=colours))
     stamps_s = np.array([keyframe.stamp_s for keyframe in placed.stored.keyframes[: len(poses)]])
-    if not (np.abs(stamps_s) < _LAST_S).all():
-        raise InvalidInput(f"stamps from {stamps_s.min()} to {stamps_s.max()} s do not fit Rerun")
-    stamps = np.round(1e9 * stamps_s).astype("datetime64[ns]")
+    stamps = times_of(stamps_s)
     moves = rr.Transform3D.columns(
         translation=poses[:, :3, 3], quaternion=[quaternion_of(pose) for pose in poses]
     )
@@ -134,18 +130,10 @@ def _trajectory(placed: PlacedMap) -> Iterator[Chunk]:
 
 
 def _topology(placed: PlacedMap) -> Chunk:
-    import rerun as rr
-
     ends = ((placed.area_of[arc.visit_a], placed.area_of[arc.visit_b]) for arc in _measured(placed))
     pairs = sorted({(min(pair), max(pair)) for pair in ends if pair[0] != pair[1]})
     areas = sorted(set(placed.area_of.values()))
-    nodes = rr.GraphNodes(
-        [str(area) for area in areas],
-        labels=[_name(area) for area in areas],
-        colors=[_colour(area) for area in areas],
-    )
-    edges = rr.GraphEdges([(str(a), str(b)) for a, b in pairs], graph_type="undirected")
-    return _static("/topology", nodes, edges)
+    return _static("/topology", *topology_of(areas, pairs, [name_of(area) for area in areas]))
 
 
 def _measured(placed: PlacedMap) -> list[StoredFactor]:
@@ -165,10 +153,60 @@ def _static(entity: str, *contents: AsComponents) -> Chunk:
     return Chunk.from_columns(entity, [], columns)
 
 
-def _name(area: int) -> str:
+def transform_of(pose: Pose) -> AsComponents:
+    """Return a pose, shape (4, 4), in Rerun's words."""
+    import rerun as rr
+
+    return rr.Transform3D(
+        translation=pose[:3, 3], quaternion=rr.Quaternion(xyzw=quaternion_of(pose))
+    )
+
+
+def label_of(area: int) -> AsComponents:
+    """Return the name of an area at the origin of its frame."""
+    import rerun as rr
+
+    return rr.Points3D([[0.0, 0.0, 0.0]], colors=[colour_of(area)], labels=[name_of(area)])
+
+
+def topology_of(
+    areas: Sequence[int], pairs: Iterable[tuple[int, int]], labels: Sequence[str]
+) -> tuple[AsComponents, AsComponents]:
+    """Return nodes and edges of the graph of areas.
+
+    Args:
+        areas: The nodes.
+        pairs: Areas that an edge joins.
+        labels: What is written on each node.
+    """
+    import rerun as rr
+
+    nodes = rr.GraphNodes(
+        [str(area) for area in areas],
+        labels=labels,
+        colors=[colour_of(area) for area in areas],
+    )
+    edges = rr.GraphEdges([(str(a), str(b)) for a, b in pairs], graph_type="undirected")
+    return nodes, edges
+
+
+def times_of(stamps_s: FloatArray) -> npt.NDArray[np.datetime64]:
+    """Return stamps on the timeline, shape (N,).
+
+    Raises:
+        InvalidInput: If one is beyond what Rerun counts, 292 years from 1970.
+    """
+    if not (np.abs(stamps_s) < _LAST_S).all():
+        raise InvalidInput(f"stamps from {stamps_s.min()} to {stamps_s.max()} s do not fit Rerun")
+    return np.round(1e9 * stamps_s).astype("datetime64[ns]")
+
+
+def name_of(area: int) -> str:
+    """Return what an area is called."""
     return f"area {area}"
 
 
-def _colour(area: int) -> tuple[int, int, int]:
+def colour_of(area: int) -> tuple[int, int, int]:
+    """Return red, green and blue in [0, 255]: a colour that few other areas have."""
     red, green, blue = hsv_to_rgb(area * _GOLDEN_SHARE % 1.0, 0.6, 0.95)
     return round(255 * red), round(255 * green), round(255 * blue)
