@@ -28,7 +28,7 @@ from hmt_service.viz.view import View
 from tests.browser import browser
 from tests.flat import readings
 from tests.mapped import SCANS, saved_run_in
-from tests.service.harness import DEADLINE_S, running_daemon, wait_until
+from tests.service.harness import running_daemon, wait_until
 
 PAGE_DEADLINE_S = 300.0
 """The viewer compiles itself in the browser, and draws without a graphics card."""
@@ -51,7 +51,7 @@ def viewing(*arguments: object) -> Iterator[subprocess.Popen[str]]:
             yield process
         finally:
             process.send_signal(signal.SIGTERM)
-            process.wait(DEADLINE_S)
+            process.wait(PAGE_DEADLINE_S)
 
 
 def free_port() -> int:

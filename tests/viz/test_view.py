@@ -38,8 +38,15 @@ def drawn(draw: Callable[[View], object], folder: Path) -> dict[str, list[Chunk]
     return chunks_of(stream(), folder)
 
 
-def rows_of(chunks: list[Chunk], name: str) -> list[Any]:
+def ordered(chunks: list[Chunk]) -> list[Any]:
+    """Return chunks in the order in which they were logged, which is not that of a file."""
     batches = [chunk.to_record_batch() for chunk in chunks]
+    return sorted(batches, key=lambda batch: batch.column("rerun.controls.RowId")[0].as_py())
+
+
+def rows_of(chunks: list[Chunk], name: str) -> list[Any]:
+    """Return what was logged of a component, in the order in which it was."""
+    batches = ordered(chunks)
     columns = [batch.column(name) for batch in batches if name in batch.schema.names]
     return [row for column in columns for row in column.to_pylist()]
 
@@ -48,9 +55,8 @@ def series(chunks: list[Chunk]) -> list[tuple[float, float]]:
     """Return stamps (s) and values."""
     times = [
         1e-9 * stamp
-        for chunk in chunks
-        if not chunk.is_static
-        for stamp in chunk.to_record_batch().column(TIMELINE).cast("int64").to_pylist()
+        for batch in ordered([chunk for chunk in chunks if not chunk.is_static])
+        for stamp in batch.column(TIMELINE).cast("int64").to_pylist()
     ]
     values = [value for (value,) in rows_of(chunks, "Scalars:scalars")]
     return sorted(zip(times, values, strict=True))
