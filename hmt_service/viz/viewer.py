@@ -111,10 +111,7 @@ def _running(options: list[str], ports: tuple[int, ...]) -> Iterator[Viewer]:
             _wait_for(process, ports, said)
             yield Viewer(process, ports)
             if process.poll():
-                raise Unavailable(
-                    f"the viewer has ended with code {process.returncode} (--web and --save need "
-                    f"no screen): {_last(said)}"
-                )
+                raise _failure(f"has ended with code {process.returncode}", said)
         finally:
             if process.poll() is None:
                 os.killpg(process.pid, signal.SIGTERM)
@@ -125,7 +122,7 @@ def _wait_for(process: subprocess.Popen[bytes], ports: tuple[int, ...], said: IO
     for port in ports:
         while not _listens(port):
             if process.poll() is not None or time.monotonic() > deadline_s:
-                raise Unavailable(f"the viewer does not start: {_last(said)}")
+                raise _failure("does not start", said)
             time.sleep(_POLL_S)
 
 
@@ -134,7 +131,8 @@ def _listens(port: int) -> bool:
         return probe.connect_ex((_HOST, port)) == 0
 
 
-def _last(said: IO[bytes]) -> str:
+def _failure(what: str, said: IO[bytes]) -> Unavailable:
+    # Without a screen it may end before it listens, or after.
     said.seek(0)
-    text = said.read().decode(errors="replace").strip()
-    return text[-_MOST_SAID:] or "it says nothing"
+    text = said.read().decode(errors="replace").strip()[-_MOST_SAID:] or "it says nothing"
+    return Unavailable(f"the viewer {what} (--web and --save need no screen): {text}")
